@@ -4,6 +4,7 @@
 //! nothing.
 
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity};
+use crate::channels::spot::TRANSMISSION;
 use crate::curve::CurvePoint;
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
@@ -222,9 +223,10 @@ fn dirty_window(f: &Finding, rig: &Rig) -> Option<Effect> {
         azimuth_deg: value(f, Quantity::AzimuthDeg),
         elevation_deg: value(f, Quantity::ElevationDeg),
         radius_deg: value(f, Quantity::RadiusDeg),
-        // Half of the light, one way: three quarters of `loss` in the middle.
-        transmission: 0.5,
-        loss: rounded((value(f, Quantity::Share) / 0.75).clamp(0.0, 1.0), 7),
+        aspect: value(f, Quantity::Aspect),
+        sharpness: value(f, Quantity::Sharpness),
+        transmission: TRANSMISSION,
+        loss: rounded((value(f, Quantity::Share) / (1.0 - TRANSMISSION * TRANSMISSION)).clamp(0.0, 1.0), 7),
         noise_m: 0.0,
     }))
 }

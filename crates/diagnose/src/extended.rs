@@ -244,9 +244,9 @@ mod tests {
         assert!(text.contains("mend its world"), "{text}");
     }
 
-    #[test]
-    fn the_simulator_reads_every_cause() {
-        let unexplained = |channel: Channel, covariate: Covariate, at: &[f64]| Finding {
+    /// A difference without a cause at some places.
+    fn unexplained(channel: Channel, covariate: Covariate, at: &[f64]) -> Finding {
+        Finding {
             status: Status::Unexplained,
             cause: None,
             channel,
@@ -259,7 +259,28 @@ mod tests {
                 ..Curve::default()
             },
             ..finding(Cause::Unexplained, &[(Quantity::SimulatedStdM, 0.01)])
-        };
+        }
+    }
+
+    /// Losses in a spot of directions, without a name.
+    fn unexplained_spot() -> Finding {
+        let parameters = [
+            (Quantity::Sensor, 0.0),
+            (Quantity::AzimuthDeg, -20.0),
+            (Quantity::ElevationDeg, -4.0),
+            (Quantity::RadiusDeg, 5.0),
+            (Quantity::Aspect, 1.5),
+            (Quantity::Sharpness, 3.0),
+            (Quantity::Share, 0.4),
+        ];
+        Finding {
+            parameters: finding(Cause::Unexplained, &parameters).parameters,
+            ..unexplained(Channel::Hits, Covariate::Direction, &[-20.0])
+        }
+    }
+
+    #[test]
+    fn the_simulator_reads_every_cause() {
         let findings = vec![
             finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 1e-4)]),
             finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 0.0)]),
@@ -281,20 +302,7 @@ mod tests {
             unexplained(Channel::Hits, Covariate::Azimuth, &[-30.0, 10.0, 50.0]),
             unexplained(Channel::Roughness, Covariate::Row, &[0.0, 1.0]),
             unexplained(Channel::Residuals, Covariate::Azimuth, &[-30.0, 10.0]),
-            Finding {
-                parameters: finding(
-                    Cause::Unexplained,
-                    &[
-                        (Quantity::Sensor, 0.0),
-                        (Quantity::AzimuthDeg, -20.0),
-                        (Quantity::ElevationDeg, -4.0),
-                        (Quantity::RadiusDeg, 5.0),
-                        (Quantity::Share, 0.4),
-                    ],
-                )
-                .parameters,
-                ..unexplained(Channel::Hits, Covariate::Direction, &[-20.0])
-            },
+            unexplained_spot(),
         ];
         for f in findings {
             let what = f.cause.map_or(f.channel.name(), Cause::name);

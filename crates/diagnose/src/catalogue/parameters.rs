@@ -11,6 +11,8 @@ identifiers! {
     Quantity {
         /// Angular size of the beam footprint or of the jitter that explains the noise.
         AngleRad = "angle_rad",
+        /// Width of a patch of directions over its height.
+        Aspect = "aspect",
         /// Middle of a patch of directions.
         AzimuthDeg = "azimuth_deg",
         /// Right end of the hidden directions.
@@ -93,7 +95,7 @@ identifiers! {
         PitchDeg = "pitch_deg",
         /// Longest jump of the range at an edge over which a beam mixes: about the length of a pulse.
         PulseM = "pulse_m",
-        /// Radius of a patch of directions.
+        /// Radius of a patch of directions along elevation.
         RadiusDeg = "radius_deg",
         /// Exponent of the decrease of the intensity with range.
         RangeExponent = "range_exponent",
@@ -113,6 +115,8 @@ identifiers! {
         Share = "share",
         /// Share of the ranges at multiples of the step.
         ShareOnComb = "share_on_comb",
+        /// Exponent of the profile of a patch of directions: 2 is a soft edge, 8 a sharp one.
+        Sharpness = "sharpness",
         /// Displacement along x over a scan.
         ShearXM = "shear_x_m",
         /// Displacement along y over a scan.

@@ -23,5 +23,6 @@ pub mod range_mixture;
 pub mod returns;
 pub mod roughness;
 pub mod row_patches;
+pub mod spot;
 pub mod tails;
 pub mod together;

@@ -6,11 +6,12 @@ use crate::pairing::FramePair;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Returns in a direction: simulated and measured ones, and the excess of those without a counterpart over the usual
-/// number for such surfaces.
+/// Returns in a direction: simulated and measured ones, simulated ones that the usual losses leave, and the excess of
+/// those without a counterpart over the usual number for such surfaces.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
     simulated: f64,
+    left: f64,
     alone: f64,
     measured: f64,
     odd: f64,
@@ -20,14 +21,21 @@ impl Losses {
     /// Adds another sum.
     pub fn add(&mut self, other: &Losses) {
         self.simulated += other.simulated;
+        self.left += other.left;
         self.alone += other.alone;
         self.measured += other.measured;
         self.odd += other.odd;
     }
 
-    /// Simulated returns.
-    pub fn simulated(&self) -> f64 {
-        self.simulated
+    /// So many losses of simulated returns, with every return that is measured in its place.
+    #[cfg(test)]
+    pub fn of(simulated: f64, lost: f64) -> Losses {
+        Losses { simulated, left: simulated, alone: lost, measured: simulated - lost, odd: 0.0 }
+    }
+
+    /// Simulated returns that the usual losses leave.
+    pub fn left(&self) -> f64 {
+        self.left
     }
 
     /// Losses beyond the usual ones. One-to-one matching leaves as many returns without a counterpart on both sides.
@@ -35,9 +43,9 @@ impl Losses {
         self.alone - self.odd * self.simulated / self.measured.max(1.0)
     }
 
-    /// The same as a share of the simulated ones.
+    /// The same as a share of what the usual losses leave.
     pub fn share(&self) -> f64 {
-        self.lost() / self.simulated.max(1.0)
+        self.lost() / self.left.max(1.0)
     }
 }
 
@@ -56,6 +64,7 @@ pub fn direction_losses(frames: &[FramePair], which: &[usize], mask: &Mask, usua
                 let alone = f64::from(u8::from(!ray.matched)) - usual[c][side];
                 if side == 0 {
                     sum.simulated += 1.0;
+                    sum.left += 1.0 - usual[c][side];
                     sum.alone += alone;
                 } else {
                     sum.measured += 1.0;
@@ -77,7 +86,8 @@ fn sum(losses: &DirectionLosses, cells: impl IntoIterator<Item = DirectionCell>)
     total(cells.into_iter().filter_map(|c| losses.get(&c)))
 }
 
-fn total<'a>(losses: impl Iterator<Item = &'a Losses>) -> Losses {
+/// Sum of losses.
+pub fn total<'a>(losses: impl Iterator<Item = &'a Losses>) -> Losses {
     losses.fold(Losses::default(), |mut all, l| {
         all.add(l);
         all
@@ -87,34 +97,31 @@ fn total<'a>(losses: impl Iterator<Item = &'a Losses>) -> Losses {
 /// Thresholds of the excess loss for connected cells, in the order in which they are tried.
 const SHARES: [f64; 6] = [0.06, 0.09, 0.13, 0.19, 0.27, 0.4];
 
-/// Fewest simulated returns of a share.
+/// Fewest returns of a share.
 const FEWEST: f64 = 40.0;
 
 /// Fewest cells of a patch.
 const FEWEST_CELLS: usize = 4;
 
 /// Largest width and height of a patch, rad.
-const LARGEST_RAD: [f64; 2] = [1.0, 0.35];
+pub(super) const LARGEST_RAD: [f64; 2] = [1.0, 0.35];
 
 /// Largest loss beside a patch, as a share of its own.
 const AROUND: f64 = 0.35;
 
-/// Smallest loss of a cell of a patch, as a share of the loss of the patch; see [`MOST`].
-const ALIKE: f64 = 0.3;
-
-/// Smallest share of the cells of a patch with such a loss.
-const MOST: f64 = 0.85;
-
 /// Directions with more losses than those around them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Patch {
-    /// Cells with a loss above `share`.
+    /// Cells with more than half of the loss in the middle.
     pub cells: BTreeSet<DirectionCell>,
-    /// Half of the loss in the middle.
-    pub share: f64,
 }
 
 impl Patch {
+    /// Its sensor.
+    pub fn sensor(&self) -> u8 {
+        self.cells.first().map_or(0, |c| c.0)
+    }
+
     /// Sum over its cells.
     pub fn sum(&self, losses: &DirectionLosses) -> Losses {
         sum(losses, self.cells.iter().copied())
@@ -123,7 +130,7 @@ impl Patch {
 
 /// Patches, the one with the most losses first.
 pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
-    let known = losses.keys().map(|c| (*c, sum(losses, neighbours(*c)))).filter(|(_, l)| l.simulated >= FEWEST);
+    let known = losses.keys().map(|c| (*c, sum(losses, neighbours(*c)))).filter(|(_, l)| l.left >= FEWEST);
     let shares: BTreeMap<DirectionCell, f64> = known.map(|(c, l)| (c, l.share())).collect();
     let mut found: Vec<Patch> = Vec::new();
     // Cells without returns between two rows do not part a patch.
@@ -140,7 +147,7 @@ pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
                 let mut more: BTreeSet<DirectionCell> = cells.iter().filter(|c| shares[c] > half).copied().collect();
                 let cells = take_together(&mut more, *middle, beside);
                 if cells.len() >= FEWEST_CELLS {
-                    found.push(Patch { cells, share: half });
+                    found.push(Patch { cells });
                 }
             }
         }
@@ -170,10 +177,6 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
         return false;
     }
     let own = sum(losses, patch.iter().copied()).share();
-    let alike = patch.iter().filter(|c| losses.get(c).is_some_and(|l| l.share() > ALIKE * own)).count();
-    if (alike as f64) < MOST * patch.len() as f64 {
-        return false;
-    }
     // The next cell may belong to it in part: the two after it count.
     let beside = |a: i32, e: i32| {
         let ring: BTreeSet<DirectionCell> = patch
@@ -183,76 +186,31 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
             .collect();
         sum(losses, ring)
     };
-    let open = |l: &Losses| l.simulated >= FEWEST && l.share() < AROUND * own;
+    let open = |l: &Losses| l.left >= FEWEST && l.share() < AROUND * own;
     let [left, right, up, down] = SIDES.map(|(a, e)| beside(a, e));
-    open(&left) && open(&right) && open(&up) && (open(&down) || down.simulated < FEWEST)
+    open(&left) && open(&right) && open(&up) && (open(&down) || down.left < FEWEST)
 }
 
-fn place(cell: &DirectionCell) -> [f64; 2] {
-    [(f64::from(cell.1) + 0.5) * AZIMUTH_RAD, (f64::from(cell.2) + 0.5) * ELEVATION_RAD]
-}
+#[cfg(test)]
+pub(super) mod testing {
+    use super::*;
 
-/// Loss of a spot (see [`spot`]) in a cell.
-pub fn share_of_spot([azimuth, elevation, radius, most]: &[f64; 4], cell: &DirectionCell) -> f64 {
-    let [a, e] = place(cell);
-    let angle = ((a - azimuth) * elevation.cos()).hypot(e - elevation);
-    most * (-(angle / radius).powi(4)).exp()
-}
-
-/// Fits a spot with the loss `most * exp(-(angle / radius)^4)`: azimuth, elevation, radius, rad, and `most`.
-pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
-    let mut cells: Vec<([f64; 2], Losses)> =
-        patch.cells.iter().filter_map(|c| Some((place(c), *losses.get(c)?))).collect();
-    let weight = |l: &Losses| l.share().max(0.0);
-    let weights: f64 = cells.iter().map(|(_, l)| weight(l)).sum::<f64>().max(1e-12);
-    let [azimuth, elevation] = [0, 1].map(|k| cells.iter().map(|(p, l)| weight(l) * p[k]).sum::<f64>() / weights);
-    // The loss of its middle is that of the third of its cells with the largest losses.
-    cells.sort_by(|a, b| b.1.share().total_cmp(&a.1.share()));
-    let middle = total(cells.iter().take(cells.len().div_ceil(3)).map(|(_, l)| l));
-    let most = middle.share().clamp(1.2 * patch.share, 1.0);
-    // The loss exceeds `share` within an angle of r ln(most / share)^(1/4).
-    // A cell stands for those between its row and the next one above.
-    let above = |c: &DirectionCell| (1..=BETWEEN_ROWS).find(|k| losses.contains_key(&(c.0, c.1, c.2 + k))).unwrap_or(1);
-    let number: i32 = patch.cells.iter().map(above).sum();
-    let area = f64::from(number) * AZIMUTH_RAD * elevation.cos() * ELEVATION_RAD;
-    [azimuth, elevation, (area / std::f64::consts::PI).sqrt() / (most / patch.share).ln().powf(0.25), most]
+    /// A field of view with 100 returns in each cell; `lost` gives the loss.
+    pub fn field(lost: impl Fn(&DirectionCell) -> f64) -> DirectionLosses {
+        let cells = (-30..30).flat_map(|az| (-12..6).map(move |el| (0, az, el)));
+        cells.map(|c: DirectionCell| (c, Losses::of(100.0, 100.0 * lost(&c)))).collect()
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::testing::field;
     use super::*;
 
-    /// A field of view; `lost` gives the loss of each cell.
-    fn field(lost: impl Fn(f64, f64) -> f64) -> DirectionLosses {
-        let cells = (-30..30).flat_map(|az| (-12..6).map(move |el| (0, az, el)));
-        cells
-            .map(|c: DirectionCell| {
-                let [azimuth, elevation] = place(&c);
-                let share = lost(azimuth, elevation);
-                let alone = 100.0 * share;
-                (c, Losses { simulated: 100.0, alone, measured: 100.0 - alone, odd: 0.0 })
-            })
-            .collect()
-    }
-
     #[test]
-    fn a_spot_is_found_and_a_band_a_side_and_nothing_are_not() {
-        let spot_of = |az: f64, el: f64| 0.4 * (-((az + 0.3).hypot(el + 0.05) / 0.09).powi(4)).exp();
-        let losses = field(spot_of);
-        let found = patches(&losses);
-        assert_eq!(found.len(), 1);
-        let [azimuth, elevation, radius, most] = spot(&losses, &found[0]);
-        assert!((azimuth + 0.3).abs() < 0.01 && (elevation + 0.05).abs() < 0.01, "{azimuth} {elevation}");
-        assert!((radius / 0.09 - 1.0).abs() < 0.15 && (most / 0.4 - 1.0).abs() < 0.1, "{radius} {most}");
-        // A sensor with a row every two degrees.
-        let few_rows: DirectionLosses = losses.into_iter().filter(|(c, _)| c.2.rem_euclid(2) == 0).collect();
-        let found = patches(&few_rows);
-        assert_eq!(found.len(), 1);
-        let [azimuth, elevation, radius, most] = spot(&few_rows, &found[0]);
-        assert!((azimuth + 0.3).abs() < 0.02 && (elevation + 0.05).abs() < 0.02, "{azimuth} {elevation}");
-        assert!((radius / 0.09 - 1.0).abs() < 0.3 && (most / 0.4 - 1.0).abs() < 0.15, "{radius} {most}");
-        assert!(patches(&field(|_, el| if el.abs() < 0.04 { 0.4 } else { 0.0 })).is_empty(), "a band");
-        assert!(patches(&field(|az, _| if az < -0.6 { 0.4 } else { 0.0 })).is_empty(), "a side");
-        assert!(patches(&field(|_, _| 0.02)).is_empty(), "nothing");
+    fn a_band_a_side_and_nothing_are_no_patches() {
+        assert!(patches(&field(|c| if c.2.abs() < 2 { 0.4 } else { 0.0 })).is_empty(), "a band");
+        assert!(patches(&field(|c| if c.1 < -23 { 0.4 } else { 0.0 })).is_empty(), "a side");
+        assert!(patches(&field(|_| 0.02)).is_empty(), "nothing");
     }
 }

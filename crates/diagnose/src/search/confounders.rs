@@ -210,7 +210,9 @@ fn drop_all(results: &mut [ChannelResult], because: &str, what: impl Fn(&Found) 
 }
 
 /// Parameters of the form of an effect, not of its size.
-const FORM: [Quantity; 14] = [
+const FORM: [Quantity; 16] = [
+    Quantity::Aspect,
+    Quantity::Sharpness,
     Quantity::ReachM,
     Quantity::DivergenceRad,
     Quantity::PulseM,
