@@ -54,9 +54,10 @@ impl Spot {
         (1.0 - passes * passes) / (1.0 - TRANSMISSION * TRANSMISSION)
     }
 
-    /// Radii within which it loses returns.
-    fn reach(&self) -> f64 {
-        (-LEAST.ln()).powf(1.0 / self.sharpness)
+    /// Azimuth and elevation from the middle within which it loses returns, rad.
+    fn reach(&self) -> [f64; 2] {
+        let radii = (-LEAST.ln()).powf(1.0 / self.sharpness);
+        [self.radius[0] / self.middle[1].cos(), self.radius[1]].map(|r| radii * r)
     }
 
     /// Loss in a cell.
@@ -66,7 +67,7 @@ impl Spot {
 
     /// Cells of a sensor that are part of it.
     pub fn cells(&self, sensor: u8) -> BTreeSet<DirectionCell> {
-        let reach = [self.radius[0] / self.middle[1].cos(), self.radius[1]].map(|r| self.reach() * r);
+        let reach = self.reach();
         let bins = |k: usize, width: f64| {
             let at = |rad: f64| (rad / width).floor() as i32;
             at(self.middle[k] - reach[k])..=at(self.middle[k] + reach[k])
@@ -78,9 +79,8 @@ impl Spot {
 
     /// Whether a cell tells the spot, or what is lost beside it.
     pub fn is_near(&self, cell: &DirectionCell) -> bool {
-        let reach = [self.radius[0] / self.middle[1].cos(), self.radius[1]].map(|r| 2.0 * self.reach() * r);
-        let place = place(cell);
-        (0..2).all(|k| (place[k] - self.middle[k]).abs() < reach[k])
+        let (reach, place) = (self.reach(), place(cell));
+        (0..2).all(|k| (place[k] - self.middle[k]).abs() < 2.0 * reach[k])
     }
 
     /// Width over height.

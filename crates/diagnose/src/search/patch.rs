@@ -185,7 +185,7 @@ fn curve(patch: &Patch, of_estimate: &[DirectionLosses], spot: &Spot) -> Curve {
             measured: 1.0 - lost,
             before: 1.0,
             after: 1.0 - expected / l.left(),
-            error: ((lost + 0.02) / l.left()).sqrt(),
+            error: ((lost + USUAL_LOSS) / l.left()).sqrt(),
         }
     });
     let middle = rows.iter().map(|r| f64::from(*r) + 0.5).sum::<f64>() / rows.len().max(1) as f64;

@@ -89,7 +89,7 @@ impl SensorEffect for DirtyWindow {
         let middle = in_vehicle(crate::rig::direction(azimuth, elevation));
         let left = in_vehicle([-azimuth.sin(), azimuth.cos(), 0.0]);
         let (radius, sharpness) = (self.radius_deg.to_radians() as f32, self.sharpness as f32);
-        // Of a unit length away from the centre, what `x` to the side leaves.
+        // What the square of an angle to the side of the centre loses, since it is divided by the aspect.
         let narrowing = 1.0 - (self.aspect as f32).powi(-2);
         let mut random = draws.of_frame();
         for echo in scan.returns_mut().filter(|e| usize::from(e.sensor) == number) {
