@@ -32,7 +32,8 @@ pub struct Diagnosis {
     /// What detectors gain on measured data, where it was asked for (`--detectors`).
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub detectors: Vec<DetectorGain>,
-    /// Causes that these data cannot tell, whatever is found: of a twin, and of different streets.
+    /// Causes that these data cannot tell, whatever is found: of a twin, of different streets, and where the data lack
+    /// what shows them. Every other cause was looked for.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub not_identifiable: Vec<Unidentifiable>,
     /// Hypotheses that were considered and what became of them.

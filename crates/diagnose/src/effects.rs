@@ -9,6 +9,7 @@ use crate::curve::CurvePoint;
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
 use sensor::beams::Pick;
+use sensor::directions::Sensors;
 use sensor::effects::{
     AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamIntensity, BeamRangeOffset, Clock,
     CoordinateRounding, Covariate as TableCovariate, DirtyWindow, DualReturns, Effect, EgoAttitude, Empirical,
@@ -20,6 +21,12 @@ use sensor::{Rig, Sensor};
 
 /// A standard deviation of range that no finding reaches, m: the limit of an effect that has to be given one.
 const NO_LIMIT_M: f64 = 10.0;
+
+/// Elevations of the rows of each sensor, degrees; none where they are not known.
+pub(crate) fn rows_deg(sensors: &Sensors) -> Vec<Vec<f64>> {
+    let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
+    sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect()
+}
 
 /// Gives every finding its effects. `rows_deg` holds the elevations of the rows of every sensor.
 pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<f64>]) {

@@ -3,7 +3,9 @@
 mod baked_in;
 mod curves;
 mod known;
+mod lacking;
 mod notes;
+mod places;
 mod reached;
 mod report;
 mod verification;
@@ -14,14 +16,16 @@ pub(crate) use verification::{Distances, GainFrames, of_channels};
 pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::known::Known;
+use self::lacking::add_what_is_lacking;
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
+use self::places::places_of;
 use self::report::corrected;
 use self::verification::{Verification, measure_gain};
 use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::motion;
 use crate::diagnosis::{Diagnosis, Gain, Unidentifiable, Verdict};
-use crate::effects::fill_effects;
+use crate::effects::{fill_effects, rows_deg};
 use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, roles};
@@ -299,17 +303,18 @@ impl Engine<'_> {
             notes.extend(search::set_aside(&mut results));
         }
         let corrected = corrected(&context, &results);
-        let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
-        let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
+        let rows_deg = rows_deg(self.sensors);
         let mut diagnosis = report(&context, results, notes);
         baked_in::take_names(&mut diagnosis, self.baked_in);
         diagnosis.not_identifiable = self.baked_in.to_vec();
+        add_what_is_lacking(&mut diagnosis, rows_deg.iter().any(|rows| !rows.is_empty()));
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
         let made_from = if let Extension::Found(made_from) = extension { Some(made_from) } else { None };
         let extended = extended_toml(&diagnosis, made_from);
         (self.progress)(Stage::Verifying, 0, 1);
         let found = diagnosis.findings.iter().map(|f| f.channel).collect();
-        let verification = Verification::new(self, &recorded, found);
+        let places = places_of(&diagnosis.findings, context.rig);
+        let verification = Verification::new(self, &recorded, found, places);
         match extension {
             Extension::Given(effects) => diagnosis.gain = verification.of(effects, remake)?.gain,
             Extension::Found(_) => measure_gain(&mut diagnosis, &verification, &extended, remake)?,

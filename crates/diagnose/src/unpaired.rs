@@ -12,7 +12,7 @@ mod sides;
 use crate::catalogue::Channel;
 use crate::channels::mask::Shown;
 use crate::diagnosis::{Diagnosis, Finding, Gain, Status, Verdict};
-use crate::effects::fill_effects;
+use crate::effects::{fill_effects, rows_deg};
 use crate::engine::{Options, Outcome, Progress, Remake, Stage, refused, report, set_reached};
 use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
@@ -25,6 +25,7 @@ use gain::Verification;
 use sensor::effects::MadeFrom;
 use sensor::{EffectList, Rig};
 use sides::{How, Side, as_pairs, edge_m};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -142,7 +143,7 @@ fn verify(
     let found = diagnosis.findings.iter().map(|f| f.channel).collect();
     let gain = verification.of(&found, Some(&list).filter(|list| !list.effects.is_empty()), remake)?;
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    set_reached(diagnosis);
+    set_reached(diagnosis, &BTreeMap::new());
     Ok(extended)
 }
 
@@ -228,8 +229,7 @@ fn search_all(
     diagnosis.not_identifiable = limits::not_identifiable();
     diagnosis.minimum_detectable.retain(|cause, _| diagnosis.not_identifiable.iter().all(|n| n.cause != *cause));
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
-    let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
-    Ok((diagnosis, unpaired.side.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect()))
+    Ok((diagnosis, rows_deg(&unpaired.side.sensors)))
 }
 
 /// What recording tells noise of the sensor from rough surfaces.

@@ -2,6 +2,7 @@
 //!
 //! A few cases of the large set, `cargo xtask bench blind`, as a regression test of the diagnosis.
 
+use diagnose::{Cause, Diagnosis, Verdict};
 use lidarshift_blind::{CAUSES, Kind, draw_case, write_case};
 use rayon::prelude::*;
 use score::{CaseSize, Outcome, score};
@@ -11,7 +12,21 @@ fn outcome(seed: u64, kind: Kind) -> Outcome {
     let folder = tempfile::tempdir().unwrap();
     let truth = write_case(&draw_case(seed, kind, CaseSize::USUAL), folder.path()).unwrap();
     let found = diagnosed(folder.path(), "simulated").unwrap();
+    assert_eq!(unanswered(&found.diagnosis), [], "seed {seed}");
     score(&truth, &serde_json::to_value(&found.diagnosis).unwrap(), 0.0)
+}
+
+/// Causes of which a diagnosis of comparable data says nothing: neither found, nor looked for, nor beyond these data.
+fn unanswered(diagnosis: &Diagnosis) -> Vec<Cause> {
+    if diagnosis.verdict == Verdict::NotScenarioIdentical {
+        return vec![];
+    }
+    let is_answered = |cause: &Cause| {
+        *cause == Cause::Unexplained
+            || diagnosis.considered.iter().any(|c| c.cause.cause == *cause)
+            || diagnosis.not_identifiable.iter().any(|n| n.cause == *cause)
+    };
+    Cause::ALL.iter().copied().filter(|cause| !is_answered(cause)).collect()
 }
 
 fn single(cause: &str) -> Kind {

@@ -33,10 +33,11 @@ pub(super) fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usiz
     print_gain(&diagnosis.gain, "extended.toml");
     if !diagnosis.not_identifiable.is_empty() {
         outln!("these data cannot identify:");
-        diagnosis
-            .not_identifiable
-            .iter()
-            .for_each(|n| outln!("  {}: {}; to identify it, record {}", n.cause, n.why, n.tell_by));
+        for alike in diagnosis.not_identifiable.chunk_by(|a, b| (&a.why, &a.tell_by) == (&b.why, &b.tell_by)) {
+            let causes: Vec<&str> = alike.iter().map(|n| n.cause.name()).collect();
+            let them = if causes.len() == 1 { "it" } else { "them" };
+            outln!("  {}: {}; to identify {them}, record {}", causes.join(", "), alike[0].why, alike[0].tell_by);
+        }
     }
     if corrected > 0 {
         outln!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());

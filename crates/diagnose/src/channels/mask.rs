@@ -1,6 +1,7 @@
 //! Directions and ranges without returns whatever the scene: parts of the ego vehicle in the field of view, and the
 //! largest range.
 
+use super::range_ends::RangeEnd;
 use super::returns::OWN_CAR_M;
 use crate::pairing::{FramePair, Lies, Ray};
 use rayon::prelude::*;
@@ -10,10 +11,10 @@ use std::f64::consts::FRAC_PI_2;
 /// Rays that are hidden, whatever the laws of losses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mask {
-    /// Nothing is measured beyond this, m.
-    pub cut_m: Option<f64>,
-    /// Nothing is measured nearer than this, m.
-    pub near_m: Option<f64>,
+    /// Nothing is measured beyond this.
+    pub cut: Option<RangeEnd>,
+    /// Nothing is measured nearer than this.
+    pub near: Option<RangeEnd>,
     /// Hidden cells of directions.
     pub blocked: BTreeSet<DirectionCell>,
     /// Cells at their edge, which are hidden in part.
@@ -40,16 +41,15 @@ pub fn direction_cell(ray: &Ray) -> DirectionCell {
 impl Mask {
     /// Whether a ray is hidden, or may be.
     pub fn hides(&self, ray: &Ray) -> bool {
-        // Range noise moves returns near the largest range across it.
         let range_m = f64::from(ray.range_m);
-        self.cut_m.is_some_and(|cut| range_m > 0.985 * cut)
-            || self.near_m.is_some_and(|near| range_m < 1.015 * near)
+        self.cut.is_some_and(|cut| range_m > cut.about_m()[0])
+            || self.near.is_some_and(|near| range_m < near.about_m()[1])
             || !self.around.is_empty() && self.around.contains(&direction_cell(ray))
     }
 
     /// Whether it hides nothing.
     pub fn is_empty(&self) -> bool {
-        self.cut_m.is_none() && self.near_m.is_none() && self.blocked.is_empty()
+        self.cut.is_none() && self.near.is_none() && self.blocked.is_empty()
     }
 }
 
@@ -104,12 +104,21 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
     which.par_iter().map(one).reduce(DirectionCounts::new, merge)
 }
 
-/// Fewest simulated returns of a cell that is judged.
+/// Fewest returns that are expected of a cell that is judged.
 const FEWEST: f64 = 15.0;
 
-/// Share of the simulated returns of a cell that are measured; `None` with too few.
-fn share_seen(counts: &DirectionCounts, cell: &DirectionCell) -> Option<f64> {
-    counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, ..]| seen / n)
+/// Least share of its returns that other losses keep in a cell that is judged: where less is left, the tails of their
+/// laws decide.
+const LEAST_KEPT: f64 = 0.25;
+
+/// Share of the returns of each cell that other losses keep.
+type Kept<'a> = &'a dyn Fn(&DirectionCell) -> f64;
+
+/// Share of the returns that other losses keep in a cell that are measured; `None` where these are too few.
+fn share_seen(counts: &DirectionCounts, kept: Kept, cell: &DirectionCell) -> Option<f64> {
+    let [n, seen, ..] = counts.get(cell)?;
+    let kept = kept(cell);
+    (kept >= LEAST_KEPT && n * kept >= FEWEST).then(|| seen / (n * kept))
 }
 
 /// Fewest cells of an occlusion.
@@ -122,10 +131,10 @@ const WHOLE_SIDE_CELLS: usize = 100;
 /// a cell.
 const ON_EGO_VEHICLE: f64 = 0.4;
 
-/// Share of the simulated returns below which a cell is empty.
+/// Share of the expected returns below which a cell is empty.
 const EMPTY: f64 = 0.02;
 
-/// Share of the simulated returns below which a cell is dark.
+/// Share of the expected returns below which a cell is dark.
 const DARK: f64 = 0.12;
 
 /// How the measured scene lies against the simulated one.
@@ -141,27 +150,24 @@ pub enum Shown {
     Another,
 }
 
-/// Hidden cells: almost no simulated return is measured although `expected`, the share that other losses keep in a
-/// cell, says that it should.
+/// Hidden cells: almost none of the simulated returns is measured that other losses keep.
 ///
 /// Cells are judged in connected regions. A region counts if it stands out, see [`Region::stands_out`]. Where the
 /// measured scene is displaced, only regions with returns from the ego vehicle are believed, or regions that are
 /// surrounded on all sides, see [`Region::surrounded`], or on both sides of most rows, see [`Region::stands_between`].
-pub fn blocked_cells(
-    counts: &DirectionCounts,
-    shown: Shown,
-    expected: impl Fn(&DirectionCell) -> f64,
-) -> BTreeSet<DirectionCell> {
+pub fn blocked_cells(counts: &DirectionCounts, shown: Shown, kept: Kept) -> BTreeSet<DirectionCell> {
     // Another scene may have less to see in a direction, and seldom nothing at all.
     let dark_below = if shown == Shown::Another { EMPTY } else { DARK };
-    let is_dark =
-        |cell: &DirectionCell| share_seen(counts, cell).is_some_and(|seen| seen < dark_below && expected(cell) > 0.5);
+    let is_dark = |cell: &DirectionCell| share_seen(counts, kept, cell).is_some_and(|seen| seen < dark_below);
     let mut dark: BTreeSet<DirectionCell> =
         counts.keys().filter(|cell| covered(counts, cell) || is_dark(cell)).copied().collect();
     let mut blocked = BTreeSet::new();
     while let Some(first) = dark.first().copied() {
-        let region =
-            Region { counts, cells: take_together(&mut dark, first, |(s, az, el), (a, e)| Some((s, az + a, el + e))) };
+        let region = Region {
+            counts,
+            kept,
+            cells: take_together(&mut dark, first, |(s, az, el), (a, e)| Some((s, az + a, el + e))),
+        };
         let stands_out = region.stands_out(shown);
         let believed = match shown {
             Shown::InPlace => true,
@@ -171,7 +177,7 @@ pub fn blocked_cells(
         };
         if region.on_ego_vehicle() {
             // Cells of the region that are dark for another reason do not belong to the ego vehicle.
-            let empty = |c: &DirectionCell| share_seen(counts, c).is_some_and(|s| s < EMPTY);
+            let empty = |c: &DirectionCell| share_seen(counts, kept, c).is_some_and(|s| s < EMPTY);
             let own = |c: &DirectionCell| covered(counts, c) || stands_out && (shown == Shown::InPlace || empty(c));
             blocked.extend(region.cells.iter().filter(|c| own(c)));
         } else if stands_out && believed {
@@ -191,6 +197,7 @@ fn covered(counts: &DirectionCounts, cell: &DirectionCell) -> bool {
 /// Connected dark cells of one sensor.
 struct Region<'a> {
     counts: &'a DirectionCounts,
+    kept: Kept<'a>,
     cells: BTreeSet<DirectionCell>,
 }
 
@@ -198,7 +205,7 @@ impl Region<'_> {
     /// Whether returns come back beside a cell on one side. The next cell may be hidden in part; the two after it
     /// count.
     fn open(&self, (s, az, el): DirectionCell, a: i32, e: i32) -> bool {
-        (2..4).any(|k| share_seen(self.counts, &(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
+        (2..4).any(|k| share_seen(self.counts, self.kept, &(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
     }
 
     /// Whether the field of view ends beside a cell on one side, but not above, where the scene ends. Three cells
@@ -293,12 +300,8 @@ const IN_PART: f64 = 0.85;
 
 /// Cells at the edge of hidden ones: connected to them and hidden in part. None where they outnumber the hidden ones
 /// and the cells around these: then returns are lost for another reason as well.
-pub fn edge_cells(
-    blocked: &BTreeSet<DirectionCell>,
-    counts: &DirectionCounts,
-    expected: impl Fn(&DirectionCell) -> f64,
-) -> BTreeSet<DirectionCell> {
-    let in_part = |cell: &DirectionCell| share_seen(counts, cell).is_some_and(|seen| seen < IN_PART * expected(cell));
+pub fn edge_cells(blocked: &BTreeSet<DirectionCell>, counts: &DirectionCounts, kept: Kept) -> BTreeSet<DirectionCell> {
+    let in_part = |cell: &DirectionCell| share_seen(counts, kept, cell).is_some_and(|seen| seen < IN_PART);
     let mut edge = BTreeSet::new();
     let mut from: Vec<DirectionCell> = blocked.iter().copied().collect();
     while let Some(cell) = from.pop() {
@@ -339,34 +342,34 @@ mod tests {
                 counts.insert((0, az, el), [100.0, if hole || end { 2.0 } else { 97.0 }, 0.0, 0.0]);
             }
         }
-        let blocked = blocked_cells(&counts, Shown::InPlace, |_| 1.0);
+        let blocked = blocked_cells(&counts, Shown::InPlace, &|_| 1.0);
         assert_eq!(blocked.len(), 6);
-        assert!(blocked_cells(&counts, Shown::Elsewhere, |_| 1.0).is_empty(), "a displaced scene has dark regions");
-        assert_eq!(blocked_cells(&counts, Shown::MovedBack, |_| 1.0).len(), 6, "returns come back on all sides");
+        assert!(blocked_cells(&counts, Shown::Elsewhere, &|_| 1.0).is_empty(), "a displaced scene has dark regions");
+        assert_eq!(blocked_cells(&counts, Shown::MovedBack, &|_| 1.0).len(), 6, "returns come back on all sides");
         let mut beside_the_end = counts.clone();
         beside_the_end.retain(|(_, az, _), _| *az < 5);
-        assert_eq!(blocked_cells(&beside_the_end, Shown::MovedBack, |_| 1.0).len(), 6, "the field of view ends there");
+        assert_eq!(blocked_cells(&beside_the_end, Shown::MovedBack, &|_| 1.0).len(), 6, "the field of view ends there");
         let mut plate = counts.clone();
         plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| (c[2], c[3]) = (90.0, 0.2));
         assert!(
-            blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).is_empty(),
+            blocked_cells(&plate, Shown::Elsewhere, &|_| 1.0).is_empty(),
             "another vehicle came near in some frames"
         );
         plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| c[3] = 1.0);
-        assert_eq!(blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).len(), 6);
+        assert_eq!(blocked_cells(&plate, Shown::Elsewhere, &|_| 1.0).len(), 6);
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
-        assert!(blocked_cells(&counts, Shown::InPlace, |_| 0.2).is_empty(), "other losses explain it");
+        assert!(blocked_cells(&counts, Shown::InPlace, &|_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
         // Cells along its edge that are hidden in part; one that is not connected.
         let mut edges = counts.clone();
         for c in [(0, 5, -3), (0, 6, -3), (0, 7, -2), (0, 9, 4)] {
             edges.insert(c, [100.0, 60.0, 0.0, 0.0]);
         }
-        let at_edge = edge_cells(&blocked, &edges, |_| 1.0);
+        let at_edge = edge_cells(&blocked, &edges, &|_| 1.0);
         assert_eq!(at_edge.into_iter().collect::<Vec<_>>(), [(0, 5, -3), (0, 6, -3), (0, 7, -2)]);
         edges.values_mut().for_each(|c| c[1] = c[1].min(60.0));
-        assert!(edge_cells(&blocked, &edges, |_| 1.0).is_empty(), "all around is lost in part");
-        assert!(edge_cells(&blocked, &edges, |_| 0.6).is_empty(), "other losses explain it");
+        assert!(edge_cells(&blocked, &edges, &|_| 1.0).is_empty(), "all around is lost in part");
+        assert!(edge_cells(&blocked, &edges, &|_| 0.6).is_empty(), "other losses explain it");
         let under = below(&blocked, &counts);
         assert!(under.is_empty(), "the simulation has something there");
         let under = below(&[(0, 3, -5)].into(), &counts);
@@ -378,7 +381,7 @@ mod tests {
             for (az, el) in (from..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
                 side.insert((0, az, el), [100.0, if az < -7 { 0.0 } else { 97.0 }, 0.0, 0.0]);
             }
-            assert_eq!(blocked_cells(&side, Shown::InPlace, |_| 1.0).len(), found);
+            assert_eq!(blocked_cells(&side, Shown::InPlace, &|_| 1.0).len(), found);
         }
         // A plate that extends below the field of view, with returns along its upper edge alone.
         let mut low = DirectionCounts::new();
@@ -387,11 +390,11 @@ mod tests {
             let near = if hidden && el == -3 { 90.0 } else { 0.0 };
             low.insert((0, az, el), [100.0, if hidden { 0.0 } else { 97.0 }, near, near / 90.0]);
         }
-        assert_eq!(blocked_cells(&low, Shown::InPlace, |_| 1.0).len(), 27);
-        assert_eq!(blocked_cells(&low, Shown::Elsewhere, |_| 1.0).len(), 27);
+        assert_eq!(blocked_cells(&low, Shown::InPlace, &|_| 1.0).len(), 27);
+        assert_eq!(blocked_cells(&low, Shown::Elsewhere, &|_| 1.0).len(), 27);
         low.values_mut().filter(|c| c[1] == 0.0 && c[2] == 0.0).for_each(|c| c[1] = 5.0);
         assert_eq!(
-            blocked_cells(&low, Shown::Elsewhere, |_| 1.0).len(),
+            blocked_cells(&low, Shown::Elsewhere, &|_| 1.0).len(),
             9,
             "a displaced scene has dark regions beside the plate"
         );
@@ -406,7 +409,7 @@ mod tests {
                 let seen = if rows.contains(&el) && az >= 3 { if az == 3 { 0.0 } else { right } } else { 97.0 };
                 post.insert((0, az, el), [100.0, seen, 0.0, 0.0]);
             }
-            assert_eq!(blocked_cells(&post, Shown::MovedBack, |_| 1.0).len(), found);
+            assert_eq!(blocked_cells(&post, Shown::MovedBack, &|_| 1.0).len(), found);
         }
     }
 }

@@ -15,26 +15,54 @@ const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
 /// there.
 const LEAST_USUAL: f64 = 0.4;
 
-/// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.
-pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
-    cut(frames, which, |range_m| range_m)
+/// Largest width of a step, as a share of its range: the threshold of a receiver is softer than a sharp end, while laws
+/// of losses fall over a fifth of a range or more.
+const WIDEST: f64 = 0.06;
+
+/// A smallest or largest measured range.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RangeEnd {
+    /// Where it is, m.
+    pub at_m: f64,
+    /// Standard deviation of the step, as a share of that range.
+    pub width: f64,
 }
 
-/// Share of the simulated returns nearer than the smallest measured range that have a counterpart in their direction,
-/// from which on the near surface was moved and not lost.
+/// Least share of its range on either side of an end where it may take returns: range noise moves them across it.
+const LEAST_MARGIN: f64 = 0.015;
+
+impl RangeEnd {
+    /// The range about it, m, where it may take returns: two standard deviations to either side.
+    pub fn about_m(&self) -> [f64; 2] {
+        let margin = LEAST_MARGIN.max(2.0 * self.width);
+        [1.0 - margin, 1.0 + margin].map(|share| share * self.at_m)
+    }
+}
+
+/// The largest measured range: beyond it only the simulation has returns, before it both sides have.
+pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<RangeEnd> {
+    cut(frames, which, End::Far)
+}
+
+/// Share of the simulated returns nearer than the smallest measured range from which on the near surface was moved and
+/// not lost: those that have a counterpart in their direction, on the ground or at about their range.
 const MOVED: f64 = 0.1;
 
-/// The smallest measured range, m: nearer only the simulation has returns, and nothing is measured in their directions.
-pub fn near_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
-    let near_m = 1.0 / cut(frames, which, |range_m| 1.0 / range_m.max(1e-3))?;
-    let nearer = || which.iter().flat_map(|&i| &frames[i].simulated).filter(|r| r.own_range_m() < 0.985 * near_m);
-    let moved = nearer().filter(|r| r.matched).count() as f64;
-    (moved < MOVED * nearer().count() as f64).then_some(near_m)
+/// The smallest measured range: nearer only the simulation has returns. In their directions something else may be
+/// measured farther away, where the simulation has a thing that is not there.
+pub fn near_cut(frames: &[FramePair], which: &[usize]) -> Option<RangeEnd> {
+    let near = cut(frames, which, End::Near)?;
+    let below_m = (1.0 - LEAST_MARGIN) * near.at_m;
+    let nearer = || which.iter().flat_map(|&i| &frames[i].simulated).filter(|r| r.own_range_m() < below_m);
+    let is_moved = |r: &&Ray| r.matched && (r.shown || r.surface == Surface::Ground);
+    let moved = nearer().filter(is_moved).count() as f64;
+    (moved < MOVED * nearer().count() as f64).then_some(near)
 }
 
-/// The largest value of the measured returns, by a value of their range: beyond it only the simulation has returns,
-/// before it both sides have.
-fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Option<f64> {
+/// The end of the measured ranges: beyond it only the simulation has returns, before it both sides have.
+fn cut(frames: &[FramePair], which: &[usize], end: End) -> Option<RangeEnd> {
+    // A value that is larger the farther beyond.
+    let value = |range_m: f64| if end == End::Near { 1.0 / range_m.max(1e-3) } else { range_m };
     // Returns with neighbours at their range only: false alarms occur at all ranges.
     let ranges = |measured: bool| {
         let mut all: Vec<f64> = which
@@ -51,18 +79,19 @@ fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Opt
         return None;
     }
     let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
-    let between = |v: &[f64], low: f64, high: f64| above(v, low) - above(v, high);
     OUTLIER_ONE_IN.into_iter().find_map(|one_in| {
         let farthest = a[a.len() - 1 - a.len() / one_in];
-        let lost = above(&b, 1.01 * farthest);
-        let [[before_a, before_b], [inside_a, inside_b]] = [[0.9, 0.995], [0.75, 0.9]]
-            .map(|[low, high]| [&a, &b].map(|v| between(v, low * farthest, high * farthest)));
-        let beyond = above(&a, 1.01 * farthest) / lost.max(1.0);
-        let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
-        // Other losses take as much just before a step as farther inside; a law of range takes more and more.
-        let usual = (inside_a / inside_b.max(1.0)).min(1.0);
-        (step && before_b > 40.0 && usual > LEAST_USUAL && before_a > 0.7 * usual * before_b)
-            .then(|| change(&a, &b, 0.8 * farthest))
+        let at = change(&a, &b, 0.8 * farthest);
+        let lost = above(&b, 1.01 * at);
+        let beyond = above(&a, 1.01 * at) / lost.max(1.0);
+        let before = above(&b, 0.9 * at) - above(&b, 0.995 * at);
+        if lost < 60.0 || lost < 0.0015 * b.len() as f64 || beyond > 0.05 || before < 40.0 {
+            return None;
+        }
+        let end_m = value(at);
+        let step = SoftStep::fit(&sum_of(counts_about(frames, which, end_m).iter()), end);
+        let found = RangeEnd { at_m: end_m * (1.0 + step.middle), width: step.width };
+        (step.width < WIDEST && step.usual > LEAST_USUAL).then_some(found)
     })
 }
 
@@ -117,6 +146,17 @@ type Counts = [[f64; BINS]; 2];
 /// Rows meet near ground in rings, which a sensor that stands one centimetre lower sees some centimetres nearer. The
 /// simulated rings are moved to where the measured ones are.
 pub fn half_point(frames: &[FramePair], which: &[usize], blocks: &[usize], end_m: f64, end: End) -> [f64; 2] {
+    let each = counts_about(frames, which, end_m);
+    let fit = |drawn: &[usize]| end_m * (1.0 + SoftStep::fit(&sum_of(drawn.iter().map(|&i| &each[i])), end).middle);
+    let members = blocks_of(blocks);
+    let mut rng = data::stream(0, "diagnose end of ranges", 0, 0);
+    let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
+    let again: Vec<f64> = draws.par_iter().map(|drawn| fit(drawn)).collect();
+    [fit(&(0..which.len()).collect::<Vec<_>>()), deviation(&again)]
+}
+
+/// Counts about an end of each frame.
+fn counts_about(frames: &[FramePair], which: &[usize], end_m: f64) -> Vec<Counts> {
     let bin = |range_m: f64| {
         let at = (range_m / end_m - 1.0) / BIN + 0.5 * BINS as f64;
         (0.0..BINS as f64).contains(&at).then_some(at as usize)
@@ -131,17 +171,14 @@ pub fn half_point(frames: &[FramePair], which: &[usize], blocks: &[usize], end_m
         }
         counts
     };
-    let each: Vec<Counts> = which.par_iter().map(of_frame).collect();
-    let fit = |drawn: &[usize]| {
-        let mut sum: Counts = [[0.0; BINS]; 2];
-        drawn.iter().for_each(|&i| (0..2).for_each(|s| (0..BINS).for_each(|k| sum[s][k] += each[i][s][k])));
-        end_m * (1.0 + middle(&sum, end))
-    };
-    let members = blocks_of(blocks);
-    let mut rng = data::stream(0, "diagnose end of ranges", 0, 0);
-    let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
-    let again: Vec<f64> = draws.par_iter().map(|drawn| fit(drawn)).collect();
-    [fit(&(0..which.len()).collect::<Vec<_>>()), deviation(&again)]
+    which.par_iter().map(of_frame).collect()
+}
+
+fn sum_of<'a>(counts: impl Iterator<Item = &'a Counts>) -> Counts {
+    counts.fold([[0.0; BINS]; 2], |mut sum, c| {
+        sum.iter_mut().flatten().zip(c.iter().flatten()).for_each(|(s, v)| *s += v);
+        sum
+    })
 }
 
 /// Where the measured ground near a sensor lies beside the simulated one, in one frame: for each sensor, distance
@@ -185,23 +222,33 @@ fn is_ground(ray: &Ray) -> bool {
     ray.smooth && ray.surface == Surface::Ground && ray.cos_incidence > 0.05
 }
 
-/// Middle of the step of the share of returns with a counterpart, as a share of the range in the middle of the bins.
-/// Beyond the end some have one by chance, before it some have none.
-fn middle(counts: &Counts, end: End) -> f64 {
-    let sign = if end == End::Near { 1.0 } else { -1.0 };
-    let share = |x: f64| 1.0 / (1.0 + (-x).exp());
-    let surprise = |p: &[f64]| {
-        let (middle, width, usual, chance) = (p[0], p[1].exp(), share(p[2]), share(p[3]));
-        let of_bin = |k: usize| {
-            let place = (k as f64 + 0.5 - 0.5 * BINS as f64) * BIN;
-            let inside = 0.5 * libm::erfc(-sign * (place - middle) / width / std::f64::consts::SQRT_2);
-            let kept = (chance + (usual - chance) * inside).clamp(1e-4, 1.0 - 1e-4);
-            -counts[0][k] * kept.ln() - counts[1][k] * (1.0 - kept).ln()
+/// The share of returns with a counterpart about an end: a normal distribution function of the range.
+struct SoftStep {
+    /// Middle and standard deviation, as shares of the range in the middle of the bins; the middle from there.
+    middle: f64,
+    width: f64,
+    /// Share before the end, where some have none.
+    usual: f64,
+}
+
+impl SoftStep {
+    /// The most likely one. Beyond the end some have a counterpart by chance, or one of what stands behind.
+    fn fit(counts: &Counts, end: End) -> SoftStep {
+        let sign = if end == End::Near { 1.0 } else { -1.0 };
+        let share = |x: f64| 1.0 / (1.0 + (-x).exp());
+        let surprise = |p: &[f64]| {
+            let (middle, width, usual, chance) = (p[0], p[1].exp(), share(p[2]), share(p[3]));
+            let of_bin = |k: usize| {
+                let place = (k as f64 + 0.5 - 0.5 * BINS as f64) * BIN;
+                let inside = 0.5 * libm::erfc(-sign * (place - middle) / width / std::f64::consts::SQRT_2);
+                let kept = (chance + (usual - chance) * inside).clamp(1e-4, 1.0 - 1e-4);
+                -counts[0][k] * kept.ln() - counts[1][k] * (1.0 - kept).ln()
+            };
+            (0..BINS).map(of_bin).sum::<f64>()
         };
-        (0..BINS).map(of_bin).sum::<f64>()
-    };
-    let (p, _) = minimise(&[0.0, (2.0 * BIN).ln(), 2.0, -4.0], &[2.0 * BIN, 0.7, 1.0, 1.0], surprise);
-    p[0]
+        let (p, _) = minimise(&[0.0, (2.0 * BIN).ln(), 2.0, -4.0], &[2.0 * BIN, 0.7, 1.0, 1.0], surprise);
+        SoftStep { middle: p[0], width: p[1].exp(), usual: share(p[2]) }
+    }
 }
 
 #[cfg(test)]
@@ -226,7 +273,8 @@ mod tests {
                     let kept = 0.02 + 0.88 * inside;
                     (counts[0][k], counts[1][k]) = (400.0 * kept, 400.0 * (1.0 - kept));
                 }
-                let found = middle(&counts, end);
+                let SoftStep { middle: found, width: wide, usual } = SoftStep::fit(&counts, end);
+                assert!((wide / width - 1.0).abs() < 0.1 && (usual - 0.9).abs() < 0.01, "{wide} {usual}");
                 assert!((found - middle_at).abs() < 0.002, "{end:?} {middle_at} {width} {found}");
             }
         }

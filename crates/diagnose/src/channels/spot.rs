@@ -39,6 +39,18 @@ pub struct Spot {
     pub most: f64,
 }
 
+impl From<&DirtyWindow> for Spot {
+    fn from(window: &DirtyWindow) -> Spot {
+        let height = window.radius_deg.to_radians();
+        Spot {
+            middle: [window.azimuth_deg, window.elevation_deg].map(f64::to_radians),
+            radius: [window.aspect * height, height],
+            sharpness: window.sharpness,
+            most: window.loss * (1.0 - window.transmission * window.transmission),
+        }
+    }
+}
+
 /// Azimuth and elevation of the middle of a cell, rad.
 fn place(cell: &DirectionCell) -> [f64; 2] {
     [(f64::from(cell.1) + 0.5) * AZIMUTH_RAD, (f64::from(cell.2) + 0.5) * ELEVATION_RAD]

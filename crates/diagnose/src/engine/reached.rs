@@ -5,6 +5,7 @@ use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied,
 use crate::effects::cause_of;
 use crate::extended::why_none;
 use crate::search::Z_STAR;
+use std::collections::BTreeMap;
 
 /// Difference of what was promised and what was reached from which on the form of a cause does not fit.
 const FORM: f64 = 0.05;
@@ -12,23 +13,37 @@ const FORM: f64 = 0.05;
 /// Share of a channel's difference that is much of it.
 const MUCH: f64 = 0.5;
 
+/// What is gone of a part of the differences, with its distances before, after and at the floor, nats a return.
+pub(crate) struct Reached {
+    pub(crate) distances: [f64; 3],
+    pub(crate) closed: Closed,
+}
+
+/// Share of the difference in its own directions that a finding promises at least.
+const MOST: f64 = 0.9;
+
 /// Lists findings without an effect as not applied, and writes to each finding what the fits promised of its channel
-/// and what was reached there. A named cause whose effect was applied and surely reaches less than it promised, by more
-/// than 5 points, does not have the form of the difference: it is ambiguous where another cause was significant as
-/// well, else without a name. Of what the distances do not see nothing is said.
-pub(crate) fn set_reached(diagnosis: &mut Diagnosis) {
+/// and what was reached there; of one that acts in some directions what was reached in these, by its number in `places`.
+/// A named cause whose effect was applied and surely reaches less than it promised, by more than 5 points, does not have
+/// the form of the difference: it is ambiguous where another cause was significant as well, else without a name. Of
+/// what the distances do not see nothing is said.
+pub(crate) fn set_reached(diagnosis: &mut Diagnosis, places: &BTreeMap<usize, Reached>) {
     let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
     let not_applied = without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) });
     diagnosis.gain.not_applied.extend(not_applied);
     let Diagnosis { findings, gain, considered, .. } = diagnosis;
-    for finding in findings {
-        let Some(measured) = closed_of(gain, finding) else { continue };
+    for (number, finding) in findings.iter_mut().enumerate() {
+        let place = places.get(&number);
+        let Some(measured) = place.map(|place| &place.closed).or(closed_of(gain, finding)) else { continue };
         finding.reached = Some(measured.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
         let Some(promised) = finding.predicted else { continue };
-        let parts =
-            kind_of(finding).and_then(|kind| Some([*gain.kinds.get(&kind)?, *gain.channels.get(&finding.channel)?]));
+        let of_kind = || gain.kinds.get(&kind_of(finding)?).copied();
+        let part = place.map(|place| place.distances).or_else(of_kind);
+        let parts = part.and_then(|part| Some([part, *gain.channels.get(&finding.channel)?]));
         let promised = parts.map_or(promised, |parts| promised_at_least(promised, parts));
+        // What is lost in its own directions is what it was found by.
+        let promised = if place.is_some() { promised.max(MOST) } else { promised };
         let applied = !finding.effects.is_empty()
             && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
         // What the extended simulation makes no better is not what is wrong, if it promised to be much of it.

@@ -5,10 +5,11 @@
 //! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero
 //! where the two sides are two draws of the same sensor, and is the same number before and after.
 
-use super::reached::{closed_of, set_reached};
+use super::reached::{Reached, closed_of, set_reached};
 use super::report::METRIC;
 use super::{Engine, curves};
 use crate::catalogue::{Channel, Kind};
+use crate::channels::mask::DirectionCell;
 use crate::diagnosis::{Closed, Diagnosis, Finding, Gain, NotApplied};
 use crate::error::DiagnoseError;
 use crate::inference::roles::Role;
@@ -90,6 +91,8 @@ pub(crate) enum Part {
     Channel(Channel),
     /// Of a channel that is the sum over its kinds.
     Kind(Kind),
+    /// The directions in which a finding acts, by its number.
+    Place(usize),
 }
 
 /// Distances of the held-out frames, nats, frame by frame.
@@ -109,8 +112,14 @@ pub(crate) fn of_channels(
     all
 }
 
-/// The distances of some frames of a pair.
-fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usize], slide: bool) -> Distances {
+/// The distances of some frames of a pair, with those of some directions.
+fn distances(
+    context: &Context,
+    sensors: &Sensors,
+    [train, test]: [&[usize]; 2],
+    slide: bool,
+    places: &Places,
+) -> Distances {
     // Each side loses its own packets: only their number is compared.
     let packets = packets::Packets::new(context, sensors);
     let arrived = packets.arrived(context.frames);
@@ -131,10 +140,12 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
         || returns::by_table(context, train, test),
         || rayon::join(|| hits::by_table(context, train, test), || geometry::walk::by_table(context, train, test)),
     );
-    kinds.extend(lost);
+    kinds.extend(lost.kinds());
     kinds.insert(Kind::Brightness, by_brightness);
     kinds.insert(Kind::Between, mixed_pixels::by_table(context, train, test));
-    of_channels(distances, kinds)
+    let mut all = of_channels(distances, kinds);
+    all.extend(places.iter().map(|(number, cells)| (Part::Place(*number), lost.within(cells))));
+    all
 }
 
 /// At most [`FRAMES`] of some frames, evenly spread.
@@ -146,8 +157,13 @@ fn some(frames: Vec<usize>) -> Vec<usize> {
 /// A gain with the pairs of the extended simulation; no pairs where no effect could be applied.
 pub(super) struct Extended {
     pub(super) gain: Gain,
+    /// What is gone in the directions of findings, by their number.
+    places: BTreeMap<usize, Reached>,
     frames: Vec<FramePair>,
 }
+
+/// Cells of the directions in which findings act, by their number; those that act in all directions are left out.
+pub(super) type Places = BTreeMap<usize, BTreeSet<DirectionCell>>;
 
 /// Distances before, after and at the floor.
 pub(super) struct Verification<'a> {
@@ -158,16 +174,22 @@ pub(super) struct Verification<'a> {
     slide: bool,
     /// Channels in which something was found; empty for all.
     found: BTreeSet<Channel>,
+    places: Places,
     before: Distances,
 }
 
 impl<'a> Verification<'a> {
     /// Of the pair as it is, with the channels in which something was found; without any, all channels count.
-    pub(super) fn new(engine: &'a Engine<'a>, context: &'a Context<'a>, found: BTreeSet<Channel>) -> Self {
+    pub(super) fn new(
+        engine: &'a Engine<'a>,
+        context: &'a Context<'a>,
+        found: BTreeSet<Channel>,
+        places: Places,
+    ) -> Self {
         let slide = found.contains(&Channel::Slide);
         let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role)));
-        let before = distances(context, engine.sensors, &train, &test, slide);
-        Verification { engine, context, train, test, slide, found, before }
+        let before = distances(context, engine.sensors, [&train, &test], slide, &places);
+        Verification { engine, context, train, test, slide, found, places, before }
     }
 
     /// The distances by channel where nothing was found. The totals are of what was found: zero.
@@ -186,7 +208,7 @@ impl<'a> Verification<'a> {
         let zero: Distances = self.before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
         if none_applied {
             let gain = Gain { not_applied, ..self.gain(&self.before, &zero, true) };
-            return Ok(Extended { gain, frames: vec![] });
+            return Ok(Extended { gain, places: BTreeMap::new(), frames: vec![] });
         }
         let which = self.used();
         let recordings = self.engine.recordings;
@@ -200,7 +222,10 @@ impl<'a> Verification<'a> {
             [0, 1].map(|k: usize| sides.iter().map(|pair| pair[k].clone()).collect());
         let (after, frames) = self.distances_of(&which, &recordings.with_sides(&which, None, &one)?)?;
         let (floor, _) = self.distances_of(&which, &recordings.with_sides(&which, Some(&other), &one)?)?;
-        Ok(Extended { gain: Gain { not_applied, ..self.gain(&after, &floor, true) }, frames })
+        let three = [&self.before, &after, &floor];
+        let of_place = |&number: &usize| Some((number, self.frames().reached(three, Part::Place(number))?));
+        let places = self.places.keys().filter_map(of_place).collect();
+        Ok(Extended { gain: Gain { not_applied, ..self.gain(&after, &floor, true) }, places, frames })
     }
 
     /// The frames that are made anew, in order.
@@ -216,8 +241,9 @@ impl<'a> Verification<'a> {
             return;
         }
         let recorded: Vec<&FramePair> = self.used().into_iter().map(|i| &self.context.frames[i]).collect();
-        findings.par_iter_mut().filter(|f| !f.effects.is_empty()).for_each(|finding| {
-            let closed = closed_of(&extended.gain, finding).map_or(0.0, |c| c.closed);
+        findings.par_iter_mut().enumerate().filter(|(_, f)| !f.effects.is_empty()).for_each(|(number, finding)| {
+            let of_place = extended.places.get(&number).map(|place| &place.closed);
+            let closed = of_place.or(closed_of(&extended.gain, finding)).map_or(0.0, |c| c.closed);
             curves::measure(finding, &recorded, &extended.frames, closed);
         });
     }
@@ -242,14 +268,18 @@ impl<'a> Verification<'a> {
         let places = |frames: &[usize]| -> Vec<usize> {
             frames.iter().filter_map(|frame| which.iter().position(|own| own == frame)).collect()
         };
-        let distances = distances(&context, self.engine.sensors, &places(&self.train), &places(&self.test), self.slide);
+        let [train, test] = [&self.train, &self.test].map(|frames| places(frames));
+        let distances = distances(&context, self.engine.sensors, [&train, &test], self.slide, &self.places);
         Ok((distances, frames))
     }
 
     /// See [`GainFrames::gain`].
     fn gain(&self, after: &Distances, floor: &Distances, extended: bool) -> Gain {
-        let (returns, blocks) = (self.context.returns(&self.test), self.context.blocks(&self.test));
-        GainFrames { returns, blocks }.gain([&self.before, after, floor], &self.found, extended)
+        self.frames().gain([&self.before, after, floor], &self.found, extended)
+    }
+
+    fn frames(&self) -> GainFrames {
+        GainFrames { returns: self.context.returns(&self.test), blocks: self.context.blocks(&self.test) }
     }
 }
 
@@ -261,53 +291,72 @@ pub(crate) struct GainFrames {
     pub(crate) blocks: Vec<usize>,
 }
 
+/// Distances before, after and at the floor, frame by frame.
+type Three<'a> = [&'a Distances; 3];
+
+/// Share of a distance that is gone; `None` where there is none beyond the floor.
+fn closed([before, after, floor]: [f64; 3]) -> Option<f64> {
+    (before > floor).then(|| (before - after) / (before - floor))
+}
+
+/// Sums of the distances of some parts over some frames. What tables predict worse than the simulation is no distance.
+fn sums(three: Three, parts: &[Part], which: &[usize]) -> [f64; 3] {
+    let of_part = |part: &Part| three.map(|d| which.iter().map(|&i| d[part][i]).sum::<f64>().max(0.0));
+    parts.iter().map(of_part).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
+}
+
 impl GainFrames {
+    /// Sums over all frames.
+    fn all(&self, three: Three, parts: &[Part]) -> [f64; 3] {
+        sums(three, parts, &(0..self.blocks.len()).collect::<Vec<_>>())
+    }
+
+    /// Interval of the share that is gone, over blocks of frames.
+    fn interval(&self, three: Three, parts: &[Part]) -> Option<[f64; 2]> {
+        let members = blocks_of(&self.blocks);
+        let mut rng = data::stream(0, "diagnose closed", 1, 0);
+        let drawn = (0..REPETITIONS).filter_map(|_| closed(sums(three, parts, &draw_blocks(&members, &mut rng))));
+        interval_nearest(drawn.collect())
+    }
+
+    /// What is gone of a part, where there is enough of it; with its distances, nats a return.
+    fn reached(&self, three: Three, part: Part) -> Option<Reached> {
+        let all = self.all(three, &[part]);
+        let share = closed(all).filter(|_| all[0] - all[2] > ENOUGH_NATS)?;
+        let closed = Closed { closed: share, ci95: self.interval(three, &[part]) };
+        Some(Reached { distances: all.map(|nats| nats / self.returns.max(1.0)), closed })
+    }
+
     /// Sums of the distances before, after and at the floor. The totals are those of the channels in which something
     /// was `found`, of all where that is empty, and of those that the extension changed.
-    pub(crate) fn gain(&self, three: [&Distances; 3], found: &BTreeSet<Channel>, extended: bool) -> Gain {
-        let returns = self.returns.max(1.0);
-        let members = blocks_of(&self.blocks);
-        // The distances of a channel over some frames. What tables predict worse than the simulation is no distance.
-        let sums =
-            |part: &Part, which: &[usize]| three.map(|d| which.iter().map(|&i| d[part][i]).sum::<f64>().max(0.0));
-        let closed = |[before, after, floor]: [f64; 3]| (before > floor).then(|| (before - after) / (before - floor));
-        let over = |parts: &[Part], which: &[usize]| {
-            parts.iter().map(|c| sums(c, which)).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
-        };
-        let all_frames: Vec<usize> = (0..self.blocks.len()).collect();
-        let interval = |parts: &[Part]| {
-            let mut rng = data::stream(0, "diagnose closed", 1, 0);
-            let drawn = (0..REPETITIONS).filter_map(|_| closed(over(parts, &draw_blocks(&members, &mut rng))));
-            interval_nearest(drawn.collect())
-        };
-        let channel = |part: &Part| if let Part::Channel(channel) = part { Some(*channel) } else { None };
-        let kind = |part: &Part| if let Part::Kind(kind) = part { Some(*kind) } else { None };
+    pub(crate) fn gain(&self, three: Three, found: &BTreeSet<Channel>, extended: bool) -> Gain {
+        let per_return = |nats: f64| nats / self.returns.max(1.0);
+        let channel = |part: Part| if let Part::Channel(channel) = part { Some(channel) } else { None };
+        let kind = |part: Part| if let Part::Kind(kind) = part { Some(kind) } else { None };
         let changed = |part: &Part| {
-            let [before, after, _] = sums(part, &all_frames);
+            let [before, after, _] = self.all(three, &[*part]);
             (after - before).abs() > ENOUGH_NATS
         };
         let found = |c: Channel| found.is_empty() || found.contains(&c);
-        let all = || three[0].keys().copied();
-        let counted: Vec<Part> = all().filter(|p| channel(p).is_some_and(|c| found(c) || changed(p))).collect();
-        let [before, after_all, floor_all] = over(&counted, &all_frames);
-        let enough = |part: &Part| {
-            let [before, _, floor] = sums(part, &all_frames);
-            extended && before - floor > ENOUGH_NATS
-        };
-        let share = |part: Part| Some(Closed { closed: closed(sums(&part, &all_frames))?, ci95: interval(&[part]) });
-        let of_all = closed([before, after_all, floor_all]).filter(|_| extended);
+        let parts = || three[0].keys().copied();
+        let counted: Vec<Part> = parts().filter(|p| channel(*p).is_some_and(|c| found(c) || changed(p))).collect();
+        let all = self.all(three, &counted);
+        let [before, after, floor] = all.map(per_return);
+        let of_all = closed(all).filter(|_| extended);
+        let distances = |part: Part| self.all(three, &[part]).map(per_return);
+        let share = |part: Part| self.reached(three, part).filter(|_| extended).map(|reached| reached.closed);
         Gain {
             metric: METRIC.into(),
-            before: before / returns,
-            after: after_all / returns,
-            floor: floor_all / returns,
+            before,
+            after,
+            floor,
             closed: of_all,
-            ci95: of_all.and_then(|_| interval(&counted)),
-            counted: counted.iter().filter_map(channel).collect(),
-            channels: all().filter_map(|p| Some((channel(&p)?, sums(&p, &all_frames).map(|v| v / returns)))).collect(),
-            kinds: all().filter_map(|p| Some((kind(&p)?, sums(&p, &all_frames).map(|v| v / returns)))).collect(),
-            closed_by_channel: all().filter(enough).filter_map(|p| Some((channel(&p)?, share(p)?))).collect(),
-            closed_by_kind: all().filter(enough).filter_map(|p| Some((kind(&p)?, share(p)?))).collect(),
+            ci95: of_all.and_then(|_| self.interval(three, &counted)),
+            counted: counted.iter().filter_map(|p| channel(*p)).collect(),
+            channels: parts().filter_map(|p| Some((channel(p)?, distances(p)))).collect(),
+            kinds: parts().filter_map(|p| Some((kind(p)?, distances(p)))).collect(),
+            closed_by_channel: parts().filter_map(|p| Some((channel(p)?, share(p)?))).collect(),
+            closed_by_kind: parts().filter_map(|p| Some((kind(p)?, share(p)?))).collect(),
             ..Gain::default()
         }
     }
@@ -320,16 +369,16 @@ pub(super) fn measure_gain(
     extended: &str,
     remake: &dyn Remake,
 ) -> Result<(), DiagnoseError> {
-    let gain = match diagnosis.findings.is_empty() {
-        true => verification.without_extension(),
+    let (gain, places) = match diagnosis.findings.is_empty() {
+        true => (verification.without_extension(), BTreeMap::new()),
         false => {
             let effects = EffectList::parse(extended, Path::new("extended.toml"))?;
             let extended = verification.of(&effects, remake)?;
             verification.measure_curves(&mut diagnosis.findings, &extended);
-            extended.gain
+            (extended.gain, extended.places)
         }
     };
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    set_reached(diagnosis);
+    set_reached(diagnosis, &places);
     Ok(())
 }

@@ -10,7 +10,7 @@ use crate::channels::mask::{
     AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, below, blocked_cells, cells_within, direction_cell,
     direction_counts, edge_cells, with_neighbours,
 };
-use crate::channels::range_ends::{End, half_point, near_cut, range_cut};
+use crate::channels::range_ends::{End, RangeEnd, half_point, near_cut, range_cut};
 use crate::channels::returns::OWN_CAR_M;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
@@ -35,16 +35,16 @@ const OCCLUSION_SURPRISE: f64 = 20.0;
 pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let (mask, spots) = find(context, shown);
     let mut result = ChannelResult::new(Channel::Hits, context.of(Role::HoldOut).len());
-    result.found.extend(mask.cut_m.map(|cut| cut_found(context, End::Far, cut)));
-    result.found.extend(mask.near_m.map(|near| cut_found(context, End::Near, near)));
+    result.found.extend(mask.cut.map(|cut| cut_found(context, End::Far, cut)));
+    result.found.extend(mask.near.map(|near| cut_found(context, End::Near, near)));
     if !mask.blocked.is_empty() {
         result.found.push(blocked_found(context, &mask));
     }
     let patched = !spots.is_empty();
     result.found.extend(spots);
     let searched = [
-        (Cause::RangeCut, mask.cut_m.is_some()),
-        (Cause::NearCut, mask.near_m.is_some()),
+        (Cause::RangeCut, mask.cut.is_some()),
+        (Cause::NearCut, mask.near.is_some()),
         (Cause::EgoOcclusion, !mask.blocked.is_empty()),
         (Cause::DirtyWindow, patched),
     ];
@@ -68,7 +68,7 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
 pub fn cut_by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let Some(cut) = range_cut(context.frames, train) else { return vec![0.0; test.len()] };
     let rays = || train.iter().flat_map(|&i| &context.frames[i].simulated);
-    let beyond = rays().filter(|r| r.own_range_m() > cut).count() as f64 / rays().count().max(1) as f64;
+    let beyond = rays().filter(|r| r.own_range_m() > cut.at_m).count() as f64 / rays().count().max(1) as f64;
     test.iter().map(|&i| -(1.0 - beyond).ln() * context.frames[i].measured.len() as f64).collect()
 }
 
@@ -76,12 +76,12 @@ pub fn cut_by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f
 fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let select = context.of(Role::Select);
     // Another street may have nothing near.
-    let near_m = (shown != Shown::Another).then(|| near_cut(context.frames, &select)).flatten();
-    let mut mask = Mask { cut_m: range_cut(context.frames, &select), near_m, ..Mask::default() };
+    let near = (shown != Shown::Another).then(|| near_cut(context.frames, &select)).flatten();
+    let mut mask = Mask { cut: range_cut(context.frames, &select), near, ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
     // Losses that laws explain are no occlusion, whether the laws are fitted with the dark directions or without
     // them. Far ground may be dark in all directions.
-    let dark = blocked_cells(&counts, shown, |_| 1.0);
+    let dark = blocked_cells(&counts, shown, &|_| 1.0);
     let mut fits = vec![expected_shares(context, &select, &mask, &mask)];
     if !dark.is_empty() {
         let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
@@ -91,8 +91,8 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
         let of_fit = |fit: &BTreeMap<DirectionCell, f64>| fit.get(cell).copied().unwrap_or(0.0);
         fits.iter().map(of_fit).fold(f64::INFINITY, f64::min)
     };
-    mask.blocked = blocked_cells(&counts, shown, expected);
-    let edge = edge_cells(&mask.blocked, &counts, expected);
+    mask.blocked = blocked_cells(&counts, shown, &expected);
+    let edge = edge_cells(&mask.blocked, &counts, &expected);
     let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
     mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
     mask.partly = edge;
@@ -150,13 +150,13 @@ fn excludes(end: End, range_m: f64, cut_m: f64) -> bool {
 }
 
 /// The finding of a smallest or largest range.
-fn cut_found(context: &Context, end: End, on_select: f64) -> Found {
+fn cut_found(context: &Context, end: End, on_select: RangeEnd) -> Found {
     let [estimate, hold_out] = [Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let (found, cause, quantity) = match end {
         End::Near => (near_cut(context.frames, &estimate), Cause::NearCut, Quantity::MinM),
         End::Far => (range_cut(context.frames, &estimate), Cause::RangeCut, Quantity::MaxM),
     };
-    let about = found.unwrap_or(on_select);
+    let about = found.unwrap_or(on_select).at_m;
     let [cut, error] = half_point(context.frames, &estimate, &context.blocks(&estimate), about, end);
     let outside = |ray: &&Ray| excludes(end, f64::from(ray.range_m), cut);
     let beyond = |i: usize| context.frames[i].simulated.iter().filter(outside).count() as f64;

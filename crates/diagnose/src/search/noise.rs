@@ -12,6 +12,7 @@ mod tails;
 pub use self::surfaces::SurfaceShare;
 
 use self::describe::found;
+use self::edges::consider_both;
 use self::select::Selection;
 use super::{ChannelResult, Context, Z_STAR, first_demands};
 use crate::catalogue::{Cause, Channel, Quantity};
@@ -121,7 +122,9 @@ impl<'a> Search<'a> {
     fn run(&self, result: &mut ChannelResult) -> Vec<Term> {
         let selection = self.select(result);
         result.minimum.extend(self.minimum());
-        self.report(selection, result)
+        let laws = self.report(selection, result);
+        consider_both(result);
+        laws
     }
 
     /// Variances over some frames.

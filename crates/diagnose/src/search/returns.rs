@@ -13,7 +13,7 @@ use crate::catalogue::{Cause, Channel, Kind, Quantity, Unit};
 use crate::channels::mean::origins;
 use crate::channels::plumes::{Extent, MOST, PlumeFrame, plume_frame};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
-use crate::diagnosis::{Considered, Minimum, Parameter};
+use crate::diagnosis::{Minimum, Parameter};
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::counts::likelihood_of_counts;
 use crate::inference::linear::cross_validated;
@@ -258,13 +258,12 @@ impl Search<'_> {
         if outcome == "chosen" {
             self.report(kind, &evidence, result);
         }
-        result.considered.push(Considered {
-            cause: cause(kind).into(),
-            channel: Channel::Returns,
-            nats_per_ray: evidence.total / self.context.returns(&self.select),
-            z: evidence.z,
-            outcome: outcome.into(),
-        });
+        let returns = self.context.returns(&self.select);
+        for cause in causes(kind) {
+            let others = outcome == "chosen" && !result.found.iter().any(|f| f.causes.contains(cause));
+            let outcome = if others { "another cause fits their ranges better" } else { outcome };
+            result.consider(*cause, (evidence.total, evidence.z), returns, outcome);
+        }
         if kind != Odd::GroupBehind {
             result.minimum.push((cause(kind), Minimum::new(Quantity::Share, evidence.detectable)));
         }
@@ -311,12 +310,17 @@ fn grouped_gain(context: &Context) -> f64 {
     (gain(Odd::GroupInFront) + gain(Odd::GroupBehind)) / context.returns(&select).max(1.0)
 }
 
-/// The cause of a kind of returns.
-fn cause(kind: Odd) -> Cause {
+/// The causes that a kind of returns may have.
+fn causes(kind: Odd) -> &'static [Cause] {
     match kind {
-        Odd::Alone => Cause::Outliers,
-        Odd::GroupInFront | Odd::GroupBehind => Cause::MissingObject,
+        Odd::Alone => &[Cause::Outliers, Cause::Fog, Cause::Rain],
+        Odd::GroupInFront | Odd::GroupBehind => &[Cause::MissingObject],
     }
+}
+
+/// The first cause of a kind of returns.
+fn cause(kind: Odd) -> Cause {
+    causes(kind)[0]
 }
 
 /// Share on the simulated side, and the excess of the measured side over it.

@@ -8,14 +8,34 @@ use crate::channels::mask::{DirectionCell, Mask, direction_cell, on_ego_vehicle}
 use crate::pairing::Ray;
 use crate::search::Context;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Returns of a cell of directions that count as the prior of its own share of losses.
 const PRIOR_OF_DIRECTION: f64 = 30.0;
 
-/// Gains of the `test` frames by the shares of matched returns of the `train` frames, nats, by kind: by cell of range,
-/// incidence and surface; and what cells of directions add to these, with returns of the ego vehicle.
-pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<Kind, Vec<f64>> {
+/// Gains of frames by tables of the shares of matched returns, nats, frame by frame.
+pub struct Lost {
+    /// By cell of range, incidence and surface.
+    surfaces: Vec<f64>,
+    /// What each cell of directions adds to that, with returns of the ego vehicle.
+    directions: Vec<BTreeMap<DirectionCell, f64>>,
+}
+
+impl Lost {
+    /// By kind.
+    pub fn kinds(&self) -> BTreeMap<Kind, Vec<f64>> {
+        let directions = self.directions.iter().map(|cells| cells.values().sum()).collect();
+        BTreeMap::from([(Kind::Directions, directions), (Kind::Surfaces, self.surfaces.clone())])
+    }
+
+    /// Of some cells of directions.
+    pub fn within(&self, place: &BTreeSet<DirectionCell>) -> Vec<f64> {
+        self.directions.iter().map(|cells| place.iter().filter_map(|cell| cells.get(cell)).sum()).collect()
+    }
+}
+
+/// Gains of the `test` frames by the shares of matched returns of the `train` frames.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Lost {
     let hits = hit_frames(context.frames, &Mask::default());
     let unmatched = table(&hits, train).unmatched(&[]);
     // Returns whose incidence is not known, and those with a counterpart, of both sides by range.
@@ -52,13 +72,18 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<
         let by_surface = ln(kept * of_measured);
         [by_surface - ln(without * of_measured), ln(kept * of_simulated) - by_surface]
     };
+    let on_vehicle = of_ego_vehicle(context, train);
     let of_frame = |&i: &usize| {
-        let gains = context.frames[i].simulated.iter().map(of_ray);
-        gains.fold((0.0, 0.0), |(surfaces, directions), [s, d]| (surfaces + s, directions + d))
+        let (mut by_surface, mut directions) = (0.0, on_vehicle(i));
+        for ray in &context.frames[i].simulated {
+            let [surface, direction] = of_ray(ray);
+            by_surface += surface;
+            *directions.entry(direction_cell(ray)).or_default() += direction;
+        }
+        (by_surface, directions)
     };
-    let (surfaces, mut directions): (Vec<f64>, Vec<f64>) = test.par_iter().map(of_frame).unzip();
-    directions.iter_mut().zip(of_ego_vehicle(context, train, test)).for_each(|(sum, gain)| *sum += gain);
-    BTreeMap::from([(Kind::Directions, directions), (Kind::Surfaces, surfaces)])
+    let (surfaces, directions) = test.par_iter().map(of_frame).unzip();
+    Lost { surfaces, directions }
 }
 
 /// A cell of directions.
@@ -157,9 +182,12 @@ pub fn by_cell(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     test.iter().map(|&i| table.gain_by_table(&hits[i], &shares)).collect()
 }
 
-/// Gains of the `test` frames by the numbers of returns of the ego vehicle of the `train` frames in each cell of
-/// directions, nats. Returns that lie on a simulated surface, which may be its own, are none.
-fn of_ego_vehicle(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+/// Gains of a frame in each cell of directions by the numbers of returns of the ego vehicle of the `train` frames,
+/// nats. Returns that lie on a simulated surface, which may be its own, are none.
+fn of_ego_vehicle<'a>(
+    context: &'a Context,
+    train: &[usize],
+) -> impl Fn(usize) -> BTreeMap<DirectionCell, f64> + Sync + use<'a> {
     let count = |rays: &[Ray]| {
         let mut counts = BTreeMap::<DirectionCell, f64>::new();
         for ray in rays.iter().filter(|ray| on_ego_vehicle(ray)) {
@@ -176,14 +204,14 @@ fn of_ego_vehicle(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64
     }
     let frames = train.len() as f64;
     rates.values_mut().for_each(|rates| *rates = rates.map(|n| (n + 0.5) / (frames + 1.0)));
-    let of_frame = |i: &usize| {
-        let counts = count(&context.frames[*i].measured);
+    move |frame| {
+        let counts = count(&context.frames[frame].measured);
         let of_cell = |(cell, [measured, simulated]): (&DirectionCell, &[f64; 2])| {
-            counts.get(cell).copied().unwrap_or(0.0) * (measured / simulated).ln() - (measured - simulated)
+            let n = counts.get(cell).copied().unwrap_or(0.0);
+            (*cell, n * (measured / simulated).ln() - (measured - simulated))
         };
-        rates.iter().map(of_cell).sum::<f64>()
-    };
-    test.iter().map(of_frame).collect()
+        rates.iter().map(of_cell).collect()
+    }
 }
 
 #[cfg(test)]
@@ -216,7 +244,7 @@ mod tests {
         let context =
             Context { rig: &rig, frames: &frames, roles: roles(60), times: None, motion: None, to_next: vec![] };
         let [train, test] = [0, 30].map(|from| (from..from + 30).collect::<Vec<usize>>());
-        let of_kind = by_table(&context, &train, &test);
+        let of_kind = by_table(&context, &train, &test).kinds();
         [Kind::Directions, Kind::Surfaces].map(|kind| of_kind[&kind].iter().sum())
     }
 

@@ -3,8 +3,9 @@
 use super::Search;
 use crate::catalogue::Cause;
 use crate::channels::edges::{Edges, edges, steps_rad};
+use crate::diagnosis::Considered;
 use crate::inference::roles::Role;
-use crate::search::Z_STAR;
+use crate::search::{ChannelResult, Z_STAR};
 use rayon::prelude::*;
 
 /// Noise that grows as the tangent of the incidence comes from beams that go elsewhere, or from those that are wide.
@@ -31,6 +32,22 @@ impl Search<'_> {
         let expected = sum(|e| e.by_jitter) / sum(|e| e.all);
         name_by(more, error, expected)
     }
+}
+
+/// Lists noise by the tangent of the incidence under both causes: it is looked for once.
+pub(super) fn consider_both(result: &mut ChannelResult) {
+    let [jitter, wide] = BOTH.map(|cause| result.found.iter().any(|f| f.causes.contains(&cause)));
+    let mut again = Vec::new();
+    for of_jitter in result.considered.iter_mut().filter(|c| c.cause.cause == Cause::AngularJitter) {
+        let mut of_wide = Considered { cause: Cause::IncidenceNoise.into(), ..of_jitter.clone() };
+        for (line, named) in [(of_jitter, jitter), (&mut of_wide, wide)] {
+            if line.outcome == "chosen" && !named {
+                line.outcome = "edges are as ragged as the other cause makes them".into();
+            }
+        }
+        again.push(of_wide);
+    }
+    result.considered.extend(again);
 }
 
 /// Share of the expected edges that jitter makes ragged at least: how slanted edges are, and how the shots of rows lie
