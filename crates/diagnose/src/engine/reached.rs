@@ -23,8 +23,8 @@ pub(crate) struct Reached {
 const MOST: f64 = 0.9;
 
 /// Lists findings without an effect as not applied, and writes to each finding what the fits promised of its channel
-/// and what was reached there; of one that acts in some directions what was reached in these, by its number in `places`.
-/// A named cause whose effect was applied and surely reaches less than it promised, by more than 5 points, does not have
+/// and what was reached there. For one that acts in some directions, by its number in `places`, it is that of these. A
+/// named cause whose effect was applied and surely reaches less than it promised, by more than 5 points, does not have
 /// the form of the difference: it is ambiguous where another cause was significant as well, else without a name. Of
 /// what the distances do not see nothing is said.
 pub(crate) fn set_reached(diagnosis: &mut Diagnosis, places: &BTreeMap<usize, Reached>) {
