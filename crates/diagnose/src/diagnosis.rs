@@ -113,7 +113,8 @@ pub struct Finding {
     /// Share of the difference in its channel that the fits of all findings there remove, 0 to 1.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub predicted: Option<f64>,
-    /// Share of the difference in its channel that is gone with the extended simulation, as it was measured.
+    /// Share of the difference in its kind or channel that is gone with the extended simulation, as it was measured; of
+    /// what acts in some directions, in these.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub reached: Option<f64>,
     /// The finding in a sentence.

@@ -23,10 +23,13 @@ const AZIMUTH_RAD: f64 = 0.12;
 const LONG_M: f64 = 12.0;
 
 /// Fewest rows of a patch: two are needed for its offset and slope.
-const FEWEST_ROWS: usize = 4;
+const FEWEST_ROWS: usize = 3;
 
 /// Fewest returns of a row in a patch.
 const FEWEST: f64 = 3.0;
+
+/// Priors of the offsets of rows that are tried: each has half the standard deviation of the one before.
+const PRIORS: i32 = 7;
 
 /// Columns: offset of the range, m, and of the elevation, rad.
 const COLUMNS: usize = 2;
@@ -67,6 +70,21 @@ impl Band {
 
     /// Offsets of the rows in some columns, fitted together, with the prior precision of each; 0 in those without one.
     pub fn offsets(&self, precision: [Option<f64>; COLUMNS]) -> Offsets {
+        self.fitted(precision, 1.0).0
+    }
+
+    /// The same with the likeliest prior of some standard deviations: those of `widest` and halves, quarters and so on
+    /// of them. Priors are in units of the variance of what is measured, which is `variance`. Rows that are known worse
+    /// than they scatter would predict what is chance.
+    pub fn shrunk(&self, widest: [Option<f64>; COLUMNS], variance: f64) -> Offsets {
+        let halved = |k: i32| widest.map(|precision| precision.map(|p| p * 4f64.powi(k)));
+        let fits = (0..PRIORS).map(|k| self.fitted(halved(k), variance));
+        fits.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(offsets, _)| offsets).unwrap_or_default()
+    }
+
+    /// Offsets of the rows in some columns, for the prior precision of each, with the logarithm of the probability of
+    /// what is measured, but for a constant; 0 and impossible where they cannot be solved for.
+    fn fitted(&self, precision: [Option<f64>; COLUMNS], variance: f64) -> (Offsets, f64) {
         let rows = self.right.len();
         let fitted: Vec<(usize, f64)> =
             precision.iter().enumerate().filter_map(|(c, precision)| Some((c, (*precision)?))).collect();
@@ -80,10 +98,12 @@ impl Band {
         });
         let right = DVector::from_fn(n, |i, _| self.right[place(i).0][place(i).1.0]);
         let mut out: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
-        if let Some(solved) = gram.cholesky().map(|c| c.solve(&right)) {
-            (0..n).for_each(|i| out[place(i).1.0][place(i).0] = solved[i]);
-        }
-        out
+        let Some(cholesky) = gram.cholesky() else { return (out, f64::NEG_INFINITY) };
+        let solved = cholesky.solve(&right);
+        (0..n).for_each(|i| out[place(i).1.0][place(i).0] = solved[i]);
+        let of_priors = rows as f64 * fitted.iter().map(|(_, precision)| precision.ln()).sum::<f64>();
+        let of_sums = cholesky.ln_determinant();
+        (out, 0.5 * (of_priors - of_sums + right.dot(&solved) / variance))
     }
 
     /// Gain by offsets, nats.
@@ -174,8 +194,9 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> 
                 let within = from.max(0) as usize..(from + WIDE as i64).max(0) as usize;
                 let cells: Vec<(usize, Cell)> =
                     rows.range(within).filter(|(_, c)| c.n >= FEWEST).map(|(r, c)| (*r, *c)).collect();
+                let cells = even(&cells);
                 if cells.len() >= FEWEST_ROWS {
-                    add_patch(&mut out, &cells, sensor, part);
+                    add_patch(&mut out, cells, sensor, part);
                 }
             }
         }
@@ -199,14 +220,28 @@ impl Cell {
     }
 }
 
+/// Place of a row of a patch along the surface, m.
+fn along(cell: &Cell) -> f64 {
+    cell.place_m / cell.n
+}
+
+/// The most rows beside each other that are near enough to each other for an even surface; of several the first.
+fn even(cells: &[(usize, Cell)]) -> &[(usize, Cell)] {
+    let extent = |cells: &[(usize, Cell)]| {
+        let places = || cells.iter().map(|(_, c)| along(c));
+        places().fold(f64::NEG_INFINITY, f64::max) - places().fold(f64::INFINITY, f64::min)
+    };
+    let runs = (0..cells.len()).map(|from| {
+        let ends = (from + 1..=cells.len()).take_while(|to| extent(&cells[from..*to]) <= LONG_M);
+        &cells[from..ends.last().unwrap_or(from)]
+    });
+    runs.rev().max_by_key(|run| run.len()).unwrap_or(cells)
+}
+
 /// Adds a patch with its offset and slope integrated out, with half of its weight: its rows are in another one as well.
 fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part: usize) {
-    let along = |cell: &Cell| cell.place_m / cell.n;
     let middle = cells.iter().map(|(_, c)| along(c)).sum::<f64>() / cells.len() as f64;
     let place = |cell: &Cell| Vector2::new(1.0, along(cell) - middle);
-    if cells.iter().any(|(_, c)| (along(c) - middle).abs() > 0.5 * LONG_M) {
-        return;
-    }
     let mut own = Matrix2::zeros();
     let mut of_own = Vector2::zeros();
     for (_, c) in cells {
@@ -278,6 +313,19 @@ mod tests {
     }
 
     #[test]
+    fn rows_far_apart_are_no_patch_and_the_others_are() {
+        let cells = |places: &[f64]| -> Vec<(usize, Cell)> {
+            let cell = |place_m: &f64| Cell { n: 1.0, place_m: *place_m, ..Cell::default() };
+            places.iter().map(cell).enumerate().collect()
+        };
+        let rows = |places: &[f64]| even(&cells(places)).iter().map(|(row, _)| *row).collect::<Vec<_>>();
+        assert_eq!(rows(&[5.1, 6.2, 7.8, 10.1, 13.7, 19.9]), [0, 1, 2, 3, 4]);
+        assert_eq!(rows(&[7.8, 10.1, 13.7, 19.9, 32.6]), [0, 1, 2]);
+        assert_eq!(rows(&[3.0, 20.0, 2.0, 1.5]), [2, 3]);
+        assert!(rows(&[]).is_empty());
+    }
+
+    #[test]
     fn rows_are_found_beneath_errors_of_the_surfaces() {
         let mut rng = data::stream(4, "row patches", 0, 0);
         let frames: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.01)).collect();
@@ -295,9 +343,14 @@ mod tests {
         // Both columns together explain no more than the one that is there.
         let both = test.gain(&train.offsets([Some(100.0), Some(1e4)]));
         assert!((both / test.gain(&offsets) - 1.0).abs() < 0.05, "{both}");
+        // With a prior that is much too wide nothing is gained: rows of which little is known predict chance.
+        let [wide, shrunk] = [train.offsets([Some(1e-2), None]), train.shrunk([Some(1e-2), None], 1.0)];
+        assert!(test.gain(&shrunk) >= test.gain(&wide), "{} {}", test.gain(&shrunk), test.gain(&wide));
         let nothing: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.0)).collect();
         let of_nothing = total(nothing[..10].iter(), 0, &|_| true).offsets(only);
         assert!(total(nothing[10..].iter(), 0, &|_| true).gain(&of_nothing) < 8.0);
+        let shrunk = total(nothing[..10].iter(), 0, &|_| true).shrunk(only, 1.0);
+        assert!(total(nothing[10..].iter(), 0, &|_| true).gain(&shrunk).abs() < 2.0);
         // What the patches leave is the noise.
         let [squares, freedom] = nothing.iter().fold([0.0; 2], |s, f| [s[0] + f.squares, s[1] + f.freedom]);
         assert!((squares / freedom - 1.0).abs() < 0.1, "{}", squares / freedom);

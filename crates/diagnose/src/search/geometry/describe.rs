@@ -4,7 +4,7 @@ use super::curve::linear_curve;
 use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SWEEP, FLOOR_TURN_RAD};
 use super::hypotheses::Hypothesis;
 use super::steadiness::come_with_time;
-use super::sums::{Sums, group_fit, split};
+use super::sums::{Sums, group_fit, row_columns, split};
 use super::{Search, Selected};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
 use crate::channels::groups::{Group, Grouping, total};
@@ -39,7 +39,9 @@ pub(super) fn found(
     selected: Selected,
     held_out_gains: Vec<f64>,
 ) -> Found {
-    let comes_with_time = hypothesis.cause() == Cause::BeamRangeOffset && come_with_time(search, chosen);
+    let comes_with_time = row_columns(std::slice::from_ref(hypothesis))
+        .first()
+        .is_some_and(|column| come_with_time(search, *column, chosen));
     let cause = if comes_with_time { Cause::Unexplained } else { hypothesis.cause() };
     let Description { covariate, says, curve, parameters } = match hypothesis {
         Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
@@ -160,18 +162,17 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chos
             (id, with_error(v * scale, variance.sqrt() * scale, unit))
         }));
     }
+    let spread = if column == 0 { format!("{:.1} cm", std * 100.0) } else { format!("{:.3} degrees", std * scale) };
     let says = match (grouping, column) {
-        (Grouping::Row, 0) if cause == Cause::Unexplained => format!(
-            "offsets of rows grow over the recording: {:.1} cm from row to row; no cause of the catalogue does that",
-            std * 100.0
-        ),
-        (Grouping::Row, 0) => format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0),
-        (Grouping::Row, _) => {
-            format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * scale)
+        (Grouping::Row, _) if cause == Cause::Unexplained => {
+            format!(
+                "offsets of rows grow over the recording: {spread} from row to row; no cause of the catalogue does that"
+            )
         }
+        (Grouping::Row, 0) => format!("each row has a range offset of its own: {spread} from row to row"),
+        (Grouping::Row, _) => format!("each row aims otherwise than believed: by {spread} from row to row"),
         _ => format!(
-            "ranges are off by {:.1} cm in a way that depends on the {}; no cause of the catalogue does that",
-            std * 100.0,
+            "ranges are off by {spread} in a way that depends on the {}; no cause of the catalogue does that",
             if grouping == Grouping::Range { "range" } else { "azimuth" }
         ),
     };

@@ -17,9 +17,9 @@ const LEAST_SHARE: f64 = 0.5;
 /// Offsets of rows with their variances.
 type Rows = BTreeMap<Group, [f64; 2]>;
 
-/// Whether the offsets of rows in range come with time: they change over the recording, by more than a small part of
-/// their mean, and those at its beginning are not seen. Not known without times.
-pub(super) fn come_with_time(search: &Search, chosen: &[Hypothesis]) -> bool {
+/// Whether the offsets of rows in range (column 0) or in elevation (column 1) come with time: they change over the
+/// recording, by more than a small part of their mean, and those at its beginning are not seen. Not known without times.
+pub(super) fn come_with_time(search: &Search, column: usize, chosen: &[Hypothesis]) -> bool {
     if !search.sums.moments.passes {
         return false;
     }
@@ -28,10 +28,11 @@ pub(super) fn come_with_time(search: &Search, chosen: &[Hypothesis]) -> bool {
     let (early, late) = frames.split_at(frames.len() / 2);
     let moments = &search.sums.moments.of_frames;
     let at = |half: &[usize]| half.iter().map(|&f| moments[f].course(COURSE)).sum::<f64>() / half.len().max(1) as f64;
-    let rows = |half: &[usize]| search.sums.rows(half, 0, chosen);
+    let rows = |half: &[usize]| search.sums.rows(half, column, chosen);
     let [beginning, change, mean] = parts([&rows(early), &rows(late)], [at(early), at(late)]);
-    let [beginning_m, change_m, mean_m] = [beginning, change, mean].map(|rows| spread_of_rows(&rows).0);
-    change_m > FLOOR_GROUPS[0].max(LEAST_SHARE * mean_m) && beginning_m < FLOOR_GROUPS[0].max(0.5 * change_m)
+    let [beginning, change, mean] = [beginning, change, mean].map(|rows| spread_of_rows(&rows).0);
+    let least = FLOOR_GROUPS[column];
+    change > least.max(LEAST_SHARE * mean) && beginning < least.max(0.5 * change)
 }
 
 /// Of the offsets in two halves of a recording, in which a change has come by the shares `at`: those at its beginning,

@@ -264,7 +264,7 @@ impl Sums {
             let train = || (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &self.rows[select[i]]);
             for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
                 let others = row_patches::total(train(), sensor, &|p| p != part);
-                let offsets = others.offsets(precisions(columns, self.of_patches));
+                let offsets = others.shrunk(precisions(columns, self.of_patches), self.of_patches);
                 for i in (0..select.len()).filter(|&i| folds[i] == fold) {
                     let band = &self.rows[select[i]].sensors[sensor][part];
                     out[i] += band.gain(&offsets) / self.of_patches;
