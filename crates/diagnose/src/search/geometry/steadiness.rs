@@ -18,7 +18,8 @@ const LEAST_SHARE: f64 = 0.5;
 type Rows = BTreeMap<Group, [f64; 2]>;
 
 /// Whether the offsets of rows in range (column 0) or in elevation (column 1) come with time: they change over the
-/// recording, by more than a small part of their mean, and those at its beginning are not seen. Not known without times.
+/// recording, by more than a small part of their mean, and those at its beginning are not seen. Not known without
+/// times.
 pub(super) fn come_with_time(search: &Search, column: usize, chosen: &[Hypothesis]) -> bool {
     if !search.sums.moments.passes {
         return false;
