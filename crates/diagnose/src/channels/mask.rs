@@ -47,6 +47,15 @@ impl Mask {
             || !self.around.is_empty() && self.around.contains(&direction_cell(ray))
     }
 
+    /// Adds hidden directions with the share of their returns that is lost: dark ones, and others that are hidden in
+    /// part.
+    pub fn hide(&mut self, cells: impl Iterator<Item = (DirectionCell, f64)>) {
+        for (cell, lost) in cells {
+            let of = if lost > 1.0 - DARK { &mut self.blocked } else { &mut self.partly };
+            of.insert(cell);
+        }
+    }
+
     /// Whether it hides nothing.
     pub fn is_empty(&self) -> bool {
         self.cut.is_none() && self.near.is_none() && self.blocked.is_empty()

@@ -15,6 +15,9 @@ pub const USUAL_LOSS: f64 = 0.02;
 /// Smallest loss of a cell that is part of a spot.
 const LEAST: f64 = 0.01;
 
+/// Share of the returns from which on all are lost: a few come from what else is seen there, such as droplets.
+const OPAQUE: f64 = 0.95;
+
 /// Sharpness of the edge of a spot from which a fit starts: that of the effect where none is given.
 const USUAL_SHARPNESS: f64 = 4.0;
 
@@ -95,6 +98,11 @@ impl Spot {
         (0..2).all(|k| (place[k] - self.middle[k]).abs() < 2.0 * reach[k])
     }
 
+    /// Whether it lets no light through in the middle: a thing before the sensor, and no dirt.
+    pub fn is_opaque(&self) -> bool {
+        self.most > OPAQUE
+    }
+
     /// Width over height.
     pub fn aspect(&self) -> f64 {
         self.radius[0] / self.radius[1]
@@ -161,6 +169,7 @@ impl Spot {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::channels::mask::Mask;
     use crate::channels::patch::{patches, testing::field};
 
     fn spot(middle: [f64; 2], radius: [f64; 2], most: f64) -> Spot {
@@ -187,6 +196,20 @@ mod tests {
                     && cells.len() < 3 * every as usize * found[0].cells.len()
             );
         }
+    }
+
+    #[test]
+    fn what_lets_nothing_through_hides_its_directions() {
+        for (most, opaque) in [(0.85, false), (0.99, true)] {
+            let truth = Spot { sharpness: 8.0, ..spot([-0.3, -0.05], [0.16, 0.07], most) };
+            let losses = field(|c| truth.share(c));
+            let fit = Spot::fit(&losses, &patches(&losses)[0], None);
+            assert_eq!(fit.is_opaque(), opaque, "{fit:?}");
+        }
+        let window = Spot { sharpness: 8.0, ..spot([0.0, 0.0], [0.2, 0.1], 1.0) };
+        let mut mask = Mask::default();
+        mask.hide(window.cells(0).into_iter().map(|cell| (cell, window.share(&cell))));
+        assert!(mask.blocked.contains(&(0, 0, 0)) && mask.blocked.is_disjoint(&mask.partly) && !mask.partly.is_empty());
     }
 
     #[test]

@@ -32,7 +32,8 @@ const REPETITIONS: usize = 200;
 /// Simulated returns that a point of the plot needs.
 const FEWEST: f64 = 20.0;
 
-/// The search. Patches that are found are hidden from the search for laws.
+/// The search. Patches that are found are hidden from the search for laws. Those that let nothing through are parts of
+/// the ego vehicle, and are added to what the mask hides.
 pub(super) fn search(context: &Context, mask: &mut Mask) -> Vec<Found> {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let hits = hit_frames(context.frames, mask);
@@ -64,9 +65,14 @@ pub(super) fn search(context: &Context, mask: &mut Mask) -> Vec<Found> {
         if !spot.has_ends() {
             continue;
         }
+        let cells = spot.cells(patch.sensor());
+        mask.around.extend(&cells);
+        if spot.is_opaque() {
+            mask.hide(cells.into_iter().map(|cell| (cell, spot.share(&cell))));
+            continue;
+        }
         let held = of_hold_out.iter().map(|l| gain(&patch.sum(l), together.share()));
         found.push(describe(context, &patch, &spot, &blocks, &of_estimate, held.collect()));
-        mask.around.extend(spot.cells(patch.sensor()));
         if found.len() == MOST {
             break;
         }
