@@ -232,8 +232,12 @@ struct SoftStep {
 }
 
 impl SoftStep {
-    /// The most likely one. Beyond the end some have a counterpart by chance, or one of what stands behind.
+    /// The most likely one. Beyond the end some have a counterpart by chance, or one of what stands behind. Where all
+    /// have one, as in different streets, which are not compared return by return, the step is sharp.
     fn fit(counts: &Counts, end: End) -> SoftStep {
+        if counts[1].iter().sum::<f64>() == 0.0 {
+            return SoftStep { middle: 0.0, width: 0.0, usual: 1.0 };
+        }
         let sign = if end == End::Near { 1.0 } else { -1.0 };
         let share = |x: f64| 1.0 / (1.0 + (-x).exp());
         let surprise = |p: &[f64]| {
@@ -260,6 +264,12 @@ mod tests {
         let simulated: Vec<f64> = (0..2000).map(|i| 0.1 * f64::from(i) + 0.03).collect();
         let measured: Vec<f64> = (0..800).map(|i| 0.1 * f64::from(i)).chain([130.0]).collect();
         assert!((change(&measured, &simulated, 60.0) - 80.0).abs() < 0.2);
+    }
+
+    #[test]
+    fn without_counterparts_to_count_the_step_is_sharp() {
+        let SoftStep { middle, width, usual } = SoftStep::fit(&[[5.0; BINS], [0.0; BINS]], End::Far);
+        assert_eq!([middle, width, usual], [0.0, 0.0, 1.0]);
     }
 
     #[test]
