@@ -129,7 +129,20 @@ pub struct Finding {
     pub effects: Vec<sensor::Effect>,
 }
 
+impl Diagnosis {
+    /// Lists causes that these data cannot tell: no size of them is detectable.
+    pub(crate) fn cannot_tell(&mut self, causes: impl IntoIterator<Item = Unidentifiable>) {
+        self.not_identifiable.extend(causes);
+        self.minimum_detectable.retain(|cause, _| self.not_identifiable.iter().all(|n| n.cause != *cause));
+    }
+}
+
 impl Finding {
+    /// Whether it has this cause, or may have it.
+    pub fn may_be(&self, cause: Cause) -> bool {
+        self.cause == Some(cause) || self.candidates.iter().flatten().any(|c| *c == cause)
+    }
+
     /// One of its parameters.
     pub fn parameter(&self, quantity: Quantity) -> Option<&Parameter> {
         self.parameters.get(&ParameterId::Of(quantity))

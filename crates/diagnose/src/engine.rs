@@ -306,7 +306,6 @@ impl Engine<'_> {
         let rows_deg = rows_deg(self.sensors);
         let mut diagnosis = report(&context, results, notes);
         baked_in::take_names(&mut diagnosis, self.baked_in);
-        diagnosis.not_identifiable = self.baked_in.to_vec();
         add_what_is_lacking(&mut diagnosis, rows_deg.iter().any(|rows| !rows.is_empty()));
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
         let made_from = if let Extension::Found(made_from) = extension { Some(made_from) } else { None };

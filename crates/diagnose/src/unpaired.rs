@@ -226,8 +226,7 @@ fn search_all(
     for finding in diagnosis.findings.iter_mut().filter(|f| f.channel == Channel::Roughness) {
         judge_by_surface(finding, by_surface);
     }
-    diagnosis.not_identifiable = limits::not_identifiable();
-    diagnosis.minimum_detectable.retain(|cause, _| diagnosis.not_identifiable.iter().all(|n| n.cause != *cause));
+    diagnosis.cannot_tell(limits::not_identifiable());
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
     Ok((diagnosis, rows_deg(&unpaired.side.sensors)))
 }

@@ -3,17 +3,14 @@
 use crate::diagnosis::{Diagnosis, Unidentifiable, Verdict};
 
 /// Gives findings that have one of these causes, or may have it, the status `not_identifiable`, with the reason and
-/// what can tell. Nothing is detectable of these causes.
+/// what can tell, and lists these causes.
 pub(super) fn take_names(diagnosis: &mut Diagnosis, baked_in: &[Unidentifiable]) {
     for finding in &mut diagnosis.findings {
-        let of_finding = |b: &&Unidentifiable| {
-            finding.cause == Some(b.cause) || finding.candidates.iter().flatten().any(|cause| *cause == b.cause)
-        };
-        if let Some(known) = baked_in.iter().find(of_finding) {
+        if let Some(known) = baked_in.iter().find(|b| finding.may_be(b.cause)) {
             finding.becomes_not_identifiable(&format!(" ({}): {}", known.cause, known.why), &known.tell_by);
         }
     }
-    diagnosis.minimum_detectable.retain(|cause, _| baked_in.iter().all(|b| b.cause != *cause));
+    diagnosis.cannot_tell(baked_in.iter().cloned());
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
 }
 

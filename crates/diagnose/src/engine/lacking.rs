@@ -4,7 +4,7 @@
 //! listed here with the reason.
 
 use crate::catalogue::Cause;
-use crate::diagnosis::{Diagnosis, Finding, Unidentifiable};
+use crate::diagnosis::{Diagnosis, Unidentifiable};
 
 /// Causes that need the same of the data.
 struct Need {
@@ -64,19 +64,17 @@ pub(super) fn add_what_is_lacking(diagnosis: &mut Diagnosis, rows: bool) {
         diagnosis.considered.retain(|c| !ROWS.causes.contains(&c.cause.cause));
     }
     for need in (!rows).then_some(&ROWS).into_iter().chain(&OTHERS) {
-        for cause in need.causes.iter().filter(|c| !is_answered(diagnosis, **c)).collect::<Vec<_>>() {
-            let (why, tell_by) = (need.why.into(), need.tell_by.into());
-            diagnosis.not_identifiable.push(Unidentifiable { cause: *cause, why, tell_by });
-        }
+        let lacking = need.causes.iter().filter(|cause| !is_answered(diagnosis, **cause));
+        let entry =
+            |cause: &Cause| Unidentifiable { cause: *cause, why: need.why.into(), tell_by: need.tell_by.into() };
+        let entries: Vec<Unidentifiable> = lacking.map(entry).collect();
+        diagnosis.cannot_tell(entries);
     }
-    let untold = &diagnosis.not_identifiable;
-    diagnosis.minimum_detectable.retain(|cause, _| untold.iter().all(|n| n.cause != *cause));
 }
 
 /// Whether a cause was found, was looked for or is listed as one that cannot be identified.
 fn is_answered(diagnosis: &Diagnosis, cause: Cause) -> bool {
-    let found = |f: &Finding| f.cause == Some(cause) || f.candidates.iter().flatten().any(|c| *c == cause);
-    diagnosis.findings.iter().any(found)
+    diagnosis.findings.iter().any(|f| f.may_be(cause))
         || diagnosis.considered.iter().any(|c| c.cause.cause == cause)
         || diagnosis.not_identifiable.iter().any(|n| n.cause == cause)
 }

@@ -16,7 +16,7 @@ pub(super) fn places_of(findings: &[Finding], rig: &Rig) -> Places {
 
 /// Cells in which the effects of a finding hide or lose returns; `None` where one of them acts elsewhere.
 fn cells_of(effects: &[Effect], rig: &Rig) -> Option<BTreeSet<DirectionCell>> {
-    let number = |name: &str| rig.sensors.iter().position(|s| s.name == name).map(|number| number as u8);
+    let number = |name: &str| rig.find(name).map(|number| number as u8);
     let of_effect = |effect: &Effect| match effect {
         Effect::DirtyWindow(window) => Some(Spot::from(window).cells(number(&window.sensor)?)),
         Effect::EgoBodyMask(mask) if mask.boxes.is_empty() => Some(hidden_by(mask, number(&mask.sensor)?)),

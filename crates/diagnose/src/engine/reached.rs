@@ -34,7 +34,7 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, places: &BTreeMap<usize, Re
     let Diagnosis { findings, gain, considered, .. } = diagnosis;
     for (number, finding) in findings.iter_mut().enumerate() {
         let place = places.get(&number);
-        let Some(measured) = place.map(|place| &place.closed).or(closed_of(gain, finding)) else { continue };
+        let Some(measured) = closed_of(gain, place, finding) else { continue };
         finding.reached = Some(measured.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
         let Some(promised) = finding.predicted else { continue };
@@ -67,11 +67,12 @@ fn kind_of(finding: &Finding) -> Option<Kind> {
     Kind::of(cause_of(finding)).filter(|kind| kind.channel() == finding.channel)
 }
 
-/// What is gone of the difference that a finding is about.
-pub(super) fn closed_of<'a>(gain: &'a Gain, finding: &Finding) -> Option<&'a Closed> {
-    match kind_of(finding) {
-        Some(kind) => gain.closed_by_kind.get(&kind),
-        None => gain.closed_by_channel.get(&finding.channel),
+/// What is gone of the difference that a finding is about: that of its `place`, its kind or its channel.
+pub(super) fn closed_of<'a>(gain: &'a Gain, place: Option<&'a Reached>, finding: &Finding) -> Option<&'a Closed> {
+    match (place, kind_of(finding)) {
+        (Some(place), _) => Some(&place.closed),
+        (None, Some(kind)) => gain.closed_by_kind.get(&kind),
+        (None, None) => gain.closed_by_channel.get(&finding.channel),
     }
 }
 

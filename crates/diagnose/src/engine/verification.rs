@@ -242,8 +242,7 @@ impl<'a> Verification<'a> {
         }
         let recorded: Vec<&FramePair> = self.used().into_iter().map(|i| &self.context.frames[i]).collect();
         findings.par_iter_mut().enumerate().filter(|(_, f)| !f.effects.is_empty()).for_each(|(number, finding)| {
-            let of_place = extended.places.get(&number).map(|place| &place.closed);
-            let closed = of_place.or(closed_of(&extended.gain, finding)).map_or(0.0, |c| c.closed);
+            let closed = closed_of(&extended.gain, extended.places.get(&number), finding).map_or(0.0, |c| c.closed);
             curves::measure(finding, &recorded, &extended.frames, closed);
         });
     }

@@ -226,9 +226,7 @@ fn detectors(d: &Diagnosis) -> Section {
 }
 
 fn not_found(d: &Diagnosis) -> Section {
-    let found = |cause: &diagnose::Cause| {
-        d.findings.iter().any(|f| f.cause == Some(*cause) || f.candidates.iter().flatten().any(|c| c == cause))
-    };
+    let found = |cause: &diagnose::Cause| d.findings.iter().any(|f| f.may_be(*cause));
     let row = |(cause, m): (&diagnose::Cause, &diagnose::Minimum)| {
         TableRow::new(
             false,
