@@ -62,9 +62,16 @@ impl Box3 {
 
     /// Distances at which a ray enters and leaves the box, m, between 0 and `until_m`; `None` for a ray that misses it.
     pub fn path_through(&self, origin: [f64; 3], direction: [f64; 3], until_m: f64) -> Option<[f64; 2]> {
+        // Most rays pass far from most boxes: the sphere around the box is missed, or lies beyond the end.
+        let [x, y, z] = direction;
+        let [u, v, w] = [0, 1, 2].map(|k| self.center[k] - origin[k]);
+        let (along, norm2) = (u * x + v * y + w * z, x * x + y * y + z * z);
+        let radius2 = self.size.iter().map(|side| side * side).sum::<f64>() / 4.0;
+        if (u * u + v * v + w * w - radius2) * norm2 > along * along {
+            return None;
+        }
         let start = self.to_local(origin);
         let (s, c) = self.yaw_rad.sin_cos();
-        let [x, y, z] = direction;
         let local = [x * c + y * s, y * c - x * s, z];
         let (mut near, mut far) = (0.0, until_m);
         for k in 0..3 {

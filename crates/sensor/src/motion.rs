@@ -3,11 +3,14 @@
 
 mod followed;
 mod ground;
+mod matches;
 
 pub use followed::{SeenVelocity, seen_velocity};
 use geometry::Box3;
 use ground::tilt;
 pub use ground::{Ground, GroundPoint};
+pub use matches::{CELL_M, Cells};
+use matches::{OfThree, Turned};
 use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use statistics::median_upper;
@@ -61,9 +64,6 @@ impl Standing {
     }
 }
 
-/// Side of a cell in bird's-eye view, m.
-pub const CELL_M: f64 = 0.35;
-
 /// Number of speeds of the grid.
 const SPEEDS: usize = 160;
 
@@ -84,6 +84,9 @@ const FEWEST: usize = 40;
 
 /// Shortest time between a frame and the reference frames that show matches by chance, s.
 const ELSEWHERE_S: f64 = 0.5;
+
+/// Frames among which the references of a pair are chosen, at most: more would make the time quadratic.
+const REFERENCES: usize = 400;
 
 /// Edges of a frame that are compared, at most.
 const SOME: usize = 250;
@@ -111,8 +114,8 @@ pub fn own_motion(standing: Vec<Standing>, times: &[f64]) -> Driven {
     let pair = |i: usize| {
         // References: of the frames far in time, those with the most edges at the same places.
         let far = (0..frames).filter(|&j| (times[j] - times[i]).abs() > ELSEWHERE_S);
-        let mut far: Vec<&Seen> = far.map(|j| &seen[j]).collect();
-        far.sort_by_cached_key(|other| std::cmp::Reverse(hits(&seen[i].edges, other, 0.0, 0.0) as usize));
+        let mut far: Vec<&Seen> = some_of(&far.map(|j| &seen[j]).collect::<Vec<_>>(), REFERENCES);
+        far.sort_by_cached_key(|other| std::cmp::Reverse(seen[i].taken.in_common(&other.taken)));
         let [one, other, ..] = far[..] else { return None };
         Some(Pair::new(&seen[i], &seen[i + 1], [one, other], times[i + 1] - times[i]))
     };
@@ -231,34 +234,6 @@ fn cell(p: &Vector2<f64>) -> (i32, i32) {
     ((p.x / CELL_M).floor() as i32, (p.y / CELL_M).floor() as i32)
 }
 
-/// Cells of a square about the ego vehicle, in bird's-eye view.
-pub struct Cells {
-    taken: Vec<bool>,
-}
-
-impl Cells {
-    /// Cells along a side: 151 m. Edges lie within 70 m.
-    const SIDE: i32 = 432;
-
-    /// The cells that hold a point.
-    pub fn new<'a>(points: impl IntoIterator<Item = &'a Vector2<f64>>) -> Self {
-        let mut taken = vec![false; (Self::SIDE * Self::SIDE) as usize];
-        points.into_iter().filter_map(Self::place).for_each(|i| taken[i] = true);
-        Cells { taken }
-    }
-
-    fn place(p: &Vector2<f64>) -> Option<usize> {
-        let (x, y) = cell(p);
-        let [x, y] = [x, y].map(|v| v + Self::SIDE / 2);
-        ((0..Self::SIDE).contains(&x) && (0..Self::SIDE).contains(&y)).then_some((x * Self::SIDE + y) as usize)
-    }
-
-    /// Whether a point lies in a cell that holds one.
-    pub fn contains(&self, p: &Vector2<f64>) -> bool {
-        Self::place(p).is_some_and(|i| self.taken[i])
-    }
-}
-
 /// Edges in bird's-eye view, and the cells that they occupy; the ground.
 struct Seen {
     edges: Vec<Vector2<f64>>,
@@ -278,25 +253,14 @@ fn some_of<T: Copy>(values: &[T], most: usize) -> Vec<T> {
     values.iter().step_by(values.len().div_ceil(most).max(1)).copied().collect()
 }
 
-/// Number of edges that match edges of another frame if the vehicle moves ahead by `d` and turns by `yaw`, along its
-/// mean heading.
-fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
-    let (s, c) = yaw.sin_cos();
-    let (ms, mc) = (0.5 * yaw).sin_cos();
-    let on = some.iter().filter(|p| {
-        let q = Vector2::new(p.x - d * mc, p.y - d * ms);
-        other.taken.contains(&Vector2::new(c * q.x + s * q.y, -s * q.x + c * q.y))
-    });
-    on.count() as f64
-}
-
 /// Two consecutive frames, and two reference frames from elsewhere. Matches with the references are due to the scan
 /// pattern, which is static in the frame of the vehicle, and to walls, which look alike along their length.
 struct Pair<'a> {
     some: Vec<Vector2<f64>>,
     first: &'a Seen,
     second: &'a Seen,
-    elsewhere: [&'a Seen; 2],
+    /// Cells of the second frame and of the two references.
+    cells: OfThree,
     dt: f64,
     /// By speed: excess of matches with the second frame over the references at the best turn, that turn, and the
     /// excess of one reference over the other, which is chance.
@@ -306,29 +270,30 @@ struct Pair<'a> {
 impl<'a> Pair<'a> {
     fn new(first: &'a Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
         let some = some_of(&first.edges, SOME);
-        let mut pair = Pair { some, first, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
+        let cells = OfThree::new([second, elsewhere[0], elsewhere[1]].map(|frame| &frame.edges[..]));
+        let mut pair = Pair { some, first, second, cells, dt, scores: vec![[0.0; 3]; SPEEDS] };
         if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt <= LONGEST_S {
             let yaw_steps = (SHARPEST_RAD_S * dt / 0.009).ceil() as i32;
-            let yaws =
-                (-yaw_steps..=yaw_steps).map(|k| SHARPEST_RAD_S * dt * f64::from(k) / f64::from(yaw_steps.max(1)));
-            let at = |k: usize| {
-                let mut best = [f64::NEG_INFINITY, 0.0, f64::NEG_INFINITY];
-                for yaw in yaws.clone() {
-                    let [more, chance] = pair.more(SPEED_M_S * k as f64 * dt, yaw);
+            let mut best = [[f64::NEG_INFINITY, 0.0, f64::NEG_INFINITY]; SPEEDS];
+            for step in -yaw_steps..=yaw_steps {
+                let yaw = SHARPEST_RAD_S * dt * f64::from(step) / f64::from(yaw_steps.max(1));
+                let turned = Turned::new(&pair.some, yaw);
+                for (k, best) in best.iter_mut().enumerate() {
+                    let [more, chance] = pair.more(&turned, SPEED_M_S * k as f64 * dt);
                     if more > best[0] {
                         (best[0], best[1]) = (more, yaw);
                     }
                     best[2] = best[2].max(chance);
                 }
-                best
-            };
-            pair.scores = (0..SPEEDS).map(at).collect();
+            }
+            pair.scores = best.to_vec();
         }
         pair
     }
 
-    fn more(&self, d: f64, yaw: f64) -> [f64; 2] {
-        let [on, one, other] = [self.second, self.elsewhere[0], self.elsewhere[1]].map(|s| hits(&self.some, s, d, yaw));
+    /// Excess of the matches with the second frame over those with the references, and of one of these over the other.
+    fn more(&self, turned: &Turned, way_m: f64) -> [f64; 2] {
+        let [on, one, other] = turned.on(&self.cells, way_m);
         [on - 0.5 * (one + other), one - other]
     }
 
@@ -336,10 +301,12 @@ impl<'a> Pair<'a> {
     fn motion(&self, k: usize) -> Option<OwnMotion> {
         let [best, yaw, _] = self.scores[k];
         let mut sum = [0.0; 3];
-        for i in -6..=6 {
-            for j in -4..=4 {
-                let (d, yaw) = (SPEED_M_S * k as f64 * self.dt + 0.05 * f64::from(i), yaw + 0.0015 * f64::from(j));
-                let weight = (self.more(d, yaw)[0] - 0.7 * best).max(0.0).powi(2);
+        for j in -4..=4 {
+            let yaw = yaw + 0.0015 * f64::from(j);
+            let turned = Turned::new(&self.some, yaw);
+            for i in -6..=6 {
+                let d = SPEED_M_S * k as f64 * self.dt + 0.05 * f64::from(i);
+                let weight = (self.more(&turned, d)[0] - 0.7 * best).max(0.0).powi(2);
                 sum = [sum[0] + weight, sum[1] + weight * d, sum[2] + weight * yaw];
             }
         }

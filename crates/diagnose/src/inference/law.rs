@@ -2,6 +2,7 @@
 
 use crate::catalogue::Cause;
 use crate::channels::cells::ZONES;
+use std::f64::consts::FRAC_1_SQRT_2;
 
 /// A law of losses; several multiply.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,10 +59,32 @@ pub struct FittedLaw {
     pub numbers: [f64; 7],
 }
 
-/// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. The skew lets the two tails differ, as those of real
+/// A logistic step with a skew, (1 + exp(-k (x - a)))^-skew: the skew lets the two tails differ, as those of real
 /// sensors do.
-fn step(x: f64, [a, ln_k, ln_skew]: [f64; 3]) -> f64 {
-    (1.0 + (-ln_k.exp() * (x - a)).exp()).powf(-ln_skew.exp())
+#[derive(Clone, Copy)]
+struct Step {
+    place: f64,
+    steepness: f64,
+    skew: f64,
+}
+
+impl Step {
+    /// How far a covariate lies below the step, and ln(1 + exp of it).
+    fn below(&self, x: f64) -> [f64; 2] {
+        let below = -self.steepness * (x - self.place);
+        [below, below.max(0.0) + (-below.abs()).exp().ln_1p()]
+    }
+
+    fn at(&self, x: f64) -> f64 {
+        (-self.skew * self.below(x)[1]).exp()
+    }
+
+    /// Derivatives of its logarithm by place, logarithm of the steepness, and logarithm of the skew.
+    fn slopes(&self, x: f64) -> [f64; 3] {
+        let [below, soft] = self.below(x);
+        let tilt = self.skew / (1.0 + (-below).exp());
+        [-tilt * self.steepness, -tilt * below, -self.skew * soft]
+    }
 }
 
 /// Steepness of the step without skew that has the same slope at one half: d ln(kept) / dx there, over that of a
@@ -118,12 +141,15 @@ impl Law {
         }
     }
 
-    pub(super) fn steps(self) -> Vec<f64> {
-        match self {
-            Law::Random | Law::Zone(_) => vec![0.05],
-            Law::Range | Law::Incidence => vec![0.3, 0.4, 0.3, 0.005],
-            Law::Signal => vec![0.5, 0.4, 0.3, 0.005, 0.4, 0.4, 0.4],
+    /// Bounds of its numbers.
+    pub(super) fn bounds(self) -> Vec<[f64; 2]> {
+        let mut bounds = vec![[f64::NEG_INFINITY, f64::INFINITY]; self.count()];
+        if self.has_form() {
+            bounds[3] = [0.0, MOST_ANYWAY];
+        } else {
+            bounds[0] = EVEN;
         }
+        bounds
     }
 
     /// Starting points of a fit, from the cells with returns.
@@ -148,13 +174,12 @@ impl Law {
 /// Largest share that a law loses where it has no effect. A larger share is a cause of its own, a random loss.
 pub const MOST_ANYWAY: f64 = 0.025;
 
-/// Penalty on extreme steepness and skew, and on losses where the law has no effect. `usual` is the usual logarithm of
-/// the steepness.
-fn shape_penalty(ln_k: f64, usual: f64, ln_skew: f64, anyway: f64) -> f64 {
-    let beyond = (anyway - anyway.clamp(0.0, MOST_ANYWAY)) / 1e-3;
+/// What is improbable of a steepness and a skew, and of losses where the law has no effect; see
+/// [`FittedLaw::improbable`]. `usual` is the usual logarithm of the steepness.
+fn improbable_shape(ln_k: f64, usual: f64, ln_skew: f64, anyway: f64) -> [f64; 4] {
     let flat = (LEAST_STEEPNESS.ln() - steepness(ln_k, ln_skew).ln()).max(0.0) / 1e-2;
-    let of_shape = 0.5 * (ln_k - usual).powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2);
-    of_shape + beyond * beyond + flat * flat
+    let [steep, skew, anyway] = [ln_k - usual, ln_skew / 0.7, anyway / 0.01].map(|v| v * FRAC_1_SQRT_2);
+    [steep, skew, anyway, flat]
 }
 
 impl FittedLaw {
@@ -198,42 +223,86 @@ impl FittedLaw {
 
     /// Share kept where the law has no effect.
     pub fn most(&self) -> f64 {
-        1.0 - self.numbers[3].clamp(0.0, MOST_ANYWAY)
+        1.0 - self.numbers[3]
     }
 
     pub(super) fn kept(&self, at: &Where) -> f64 {
-        let [a, b, s, ..] = self.numbers;
-        let most = self.most();
-        let x = self.covariate(at).unwrap_or_default();
-        match self.law {
-            Law::Random => (1.0 - a).clamp(1e-3, 1.5),
-            Law::Zone(zone) => {
-                if in_zone(zone, at.zone) {
-                    (1.0 - a).clamp(1e-3, 1.5)
-                } else {
-                    1.0
-                }
-            }
-            Law::Range => most * step(-x, [-a, b, s]),
-            Law::Incidence | Law::Signal => most * step(x, [a, b, s]),
-        }
+        self.form().kept(at)
     }
 
-    pub(super) fn penalty(&self) -> f64 {
+    /// The law with what does not depend on the cell worked out.
+    pub(super) fn form(&self) -> Form {
+        let [a, b, s, ..] = self.numbers;
+        let place = if self.law == Law::Range { -a } else { a };
+        Form { law: *self, most: self.most(), step: Step { place, steepness: b.exp(), skew: s.exp() } }
+    }
+
+    /// What is improbable of the numbers of the law: the sum of the squares is minus the logarithm of their
+    /// probability.
+    pub(super) fn improbable(&self) -> Vec<f64> {
         match self.law {
             Law::Signal => {
                 let [_, steep, skew, anyway, brighter @ ..] = self.numbers;
-                let of = |v: f64| {
-                    let beyond = (v.abs() - MOST_BRIGHTNESS).max(0.0) / 1e-2;
-                    0.5 * (v / BRIGHTNESS).powi(2) + beyond * beyond
-                };
-                brighter.map(of).iter().sum::<f64>() + shape_penalty(steep, 0.8, skew, anyway)
+                let beyond = |v: f64| (v.abs() - MOST_BRIGHTNESS).max(0.0) / 1e-2;
+                let of = brighter.into_iter().flat_map(|v| [v / BRIGHTNESS * FRAC_1_SQRT_2, beyond(v)]);
+                of.chain(improbable_shape(steep, 0.8, skew, anyway)).collect()
             }
             Law::Range | Law::Incidence => {
                 let [_, steep, skew, anyway, ..] = self.numbers;
-                shape_penalty(steep, 1.0, skew, anyway)
+                improbable_shape(steep, 1.0, skew, anyway).to_vec()
             }
-            _ => 0.0,
+            _ => vec![],
         }
     }
 }
+
+/// A fitted law, ready to be evaluated in many cells.
+pub(super) struct Form {
+    law: FittedLaw,
+    most: f64,
+    step: Step,
+}
+
+impl Form {
+    /// Share kept in a cell.
+    pub(super) fn kept(&self, at: &Where) -> f64 {
+        let x = self.law.covariate(at).unwrap_or_default();
+        match self.law.law {
+            Law::Random => self.even(),
+            Law::Zone(zone) if in_zone(zone, at.zone) => self.even(),
+            Law::Zone(_) => 1.0,
+            Law::Range => self.most * self.step.at(-x),
+            Law::Incidence | Law::Signal => self.most * self.step.at(x),
+        }
+    }
+
+    /// Share that a law without a form keeps.
+    fn even(&self) -> f64 {
+        1.0 - self.law.numbers[0]
+    }
+
+    /// Derivatives of the logarithm of the share kept in a cell by the numbers of the law.
+    pub(super) fn slopes(&self, at: &Where) -> [f64; 7] {
+        let mut out = [0.0; 7];
+        let x = self.law.covariate(at).unwrap_or_default();
+        match self.law.law {
+            Law::Random => out[0] = -1.0 / self.even(),
+            Law::Zone(zone) if in_zone(zone, at.zone) => out[0] = -1.0 / self.even(),
+            Law::Zone(_) => {}
+            law => {
+                let sign = if law == Law::Range { -1.0 } else { 1.0 };
+                let [place, steepness, skew] = self.step.slopes(sign * x);
+                out[..3].copy_from_slice(&[sign * place, steepness, skew]);
+                out[3] = -1.0 / self.most;
+                if law == Law::Signal && at.zone > 0 {
+                    // Brighter is as if the step began lower.
+                    out[3 + at.zone] = -place;
+                }
+            }
+        }
+        out
+    }
+}
+
+/// Least and most share that a law without a form loses; of a negative one the simulation loses more.
+const EVEN: [f64; 2] = [-0.5, 0.999];

@@ -1,10 +1,12 @@
 //! Lost returns by cell: the share of simulated returns with a measured counterpart, and fits of laws to it.
 
-use super::law::{FittedLaw, Law, WHOLE_OBJECT, Where, in_zone};
-use super::simplex::minimise;
+use super::descent::{Slopes, descend};
+use super::law::{FittedLaw, Form, Law, WHOLE_OBJECT, Where, in_zone};
 use crate::channels::cells::{CELLS, ZONES, cells_around, zone_of};
 use crate::channels::hits::{HitCell, HitFrame};
+use nalgebra::DVector;
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 
 /// Counts of some frames, with the share that would match without losses.
 #[derive(Clone, Debug)]
@@ -24,6 +26,9 @@ const PRIOR_RETURNS: f64 = 60.0;
 
 /// Width of a bin of the covariate of a law whose form is free, of ln(m), ln(cos) or ln(signal): that of the cells.
 pub const FORM_BIN: f64 = 0.25;
+
+/// Shares beyond which nothing is certain.
+const CERTAIN: RangeInclusive<f64> = 1e-4..=1.0 - 1e-4;
 
 /// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;
@@ -77,7 +82,7 @@ impl LossTable {
 
     /// The same where a share is kept.
     fn matched_share(&self, kept: f64, cell: usize) -> f64 {
-        (kept * self.matches[cell]).clamp(1e-4, 1.0 - 1e-4)
+        (kept * self.matches[cell]).clamp(*CERTAIN.start(), *CERTAIN.end())
     }
 
     /// Logarithm of the likelihood of these counts.
@@ -97,23 +102,53 @@ impl LossTable {
 
     /// Fits a law together with others; parameters of the others are fitted anew.
     pub fn fit(&self, before: &[FittedLaw], law: Law) -> Vec<FittedLaw> {
-        let mut best: Option<(Vec<FittedLaw>, f64)> = None;
         let places: Vec<Where> = self.used.iter().map(|&i| self.places[i]).collect();
-        for start in law.starts(&places) {
+        let from = |start: FittedLaw| {
             let laws: Vec<FittedLaw> = before.iter().copied().chain([start]).collect();
-            let numbers: Vec<f64> = laws.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec()).collect();
-            let steps: Vec<f64> = laws.iter().flat_map(|l| l.law.steps()).collect();
-            let value = |p: &[f64]| {
-                let laws = with_numbers(&laws, p);
-                let counts = self.used.iter().map(|&i| (i, self.cells[i].simulated.n, self.cells[i].matched));
-                -self.likelihood(&laws, counts) + laws.iter().map(FittedLaw::penalty).sum::<f64>()
-            };
-            let (at, v) = minimise(&numbers, &steps, value);
-            if best.as_ref().is_none_or(|b| v < b.1) {
-                best = Some((with_numbers(&laws, &at), v));
+            let numbers = laws.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec());
+            let start = DVector::from_vec(numbers.collect());
+            let bounds: Vec<[f64; 2]> = laws.iter().flat_map(|l| l.law.bounds()).collect();
+            let with = |p: &DVector<f64>| with_numbers(&laws, p.as_slice());
+            let (at, least) = descend(start, &bounds, |p| self.improbability(&with(p)), |p| self.slopes(&with(p)));
+            (with(&at), least)
+        };
+        let fits = law.starts(&places).into_iter().map(from);
+        fits.min_by(|a, b| a.1.total_cmp(&b.1)).map(|fit| fit.0).unwrap_or_default()
+    }
+
+    /// Minus the logarithm of the probability of laws and of all counts, up to a constant.
+    fn improbability(&self, laws: &[FittedLaw]) -> f64 {
+        let forms: Vec<Form> = laws.iter().map(FittedLaw::form).collect();
+        let kept = |i: usize| forms.iter().map(|form| form.kept(&self.places[i])).product();
+        let counts = self.used.iter().map(|&i| (i, self.cells[i].simulated.n, self.cells[i].matched));
+        let of_laws = laws.iter().flat_map(FittedLaw::improbable).map(|v| v * v).sum::<f64>();
+        of_laws - self.likelihood_of(kept, counts)
+    }
+
+    /// Its derivatives by the numbers of the laws. The curvature is the information of the counts.
+    fn slopes(&self, laws: &[FittedLaw]) -> Slopes {
+        let forms: Vec<Form> = laws.iter().map(FittedLaw::form).collect();
+        let mut out = Slopes::zeros(laws.iter().map(|l| l.law.count()).sum());
+        let mut by = Vec::new();
+        for &i in &self.used {
+            let at = &self.places[i];
+            let share = forms.iter().map(|form| form.kept(at)).product::<f64>() * self.matches[i];
+            if !CERTAIN.contains(&share) {
+                continue;
             }
+            let [n, matched] = [self.cells[i].simulated.n, self.cells[i].matched];
+            by.clear();
+            forms.iter().zip(laws).for_each(|(form, law)| by.extend_from_slice(&form.slopes(at)[..law.law.count()]));
+            // By the logarithm of the share.
+            let slope = (n * share - matched) / (1.0 - share);
+            out.add(&by, slope, n * share / (1.0 - share));
         }
-        best.map(|b| b.0).unwrap_or_default()
+        let mut first = 0;
+        for law in laws {
+            out.add_improbable(law, first);
+            first += law.law.count();
+        }
+        out
     }
 
     /// Counts of a frame in the cells that are used.
@@ -284,6 +319,35 @@ impl LossTable {
     }
 }
 
+impl Slopes {
+    /// Adds a term of which the derivatives by the parameters are `by`, times its own first and second one.
+    fn add(&mut self, by: &[f64], slope: f64, curvature: f64) {
+        for (j, &of_j) in by.iter().enumerate().filter(|(_, v)| **v != 0.0) {
+            self.gradient[j] += slope * of_j;
+            for (k, &of_k) in by.iter().enumerate() {
+                self.curvature[(j, k)] += curvature * of_j * of_k;
+            }
+        }
+    }
+
+    /// Adds the squares of what is improbable of a law, whose numbers are the parameters from `first` on.
+    fn add_improbable(&mut self, law: &FittedLaw, first: usize) {
+        const STEP: f64 = 1e-6;
+        let here = law.improbable();
+        let beside = |k: usize| {
+            let mut moved = *law;
+            moved.numbers[k] += STEP;
+            moved.improbable()
+        };
+        let beside: Vec<Vec<f64>> = (0..law.law.count()).map(beside).collect();
+        for (r, &value) in here.iter().enumerate() {
+            let mut by = vec![0.0; first];
+            by.extend(beside.iter().map(|moved| (moved[r] - value) / STEP));
+            self.add(&by, 2.0 * value, 2.0);
+        }
+    }
+}
+
 fn with_numbers(laws: &[FittedLaw], numbers: &[f64]) -> Vec<FittedLaw> {
     let mut at = 0;
     laws.iter()
@@ -302,6 +366,7 @@ mod tests {
     use super::*;
     use crate::channels::cells::{COS_BINS, RANGE_BINS};
     use crate::inference::law::LAWS;
+    use crate::inference::simplex::minimise;
 
     /// Counts without noise: ground where cos = 1 / R, walls of all angles.
     fn table(keep: impl Fn(f64, f64, usize) -> f64) -> LossTable {
@@ -332,6 +397,40 @@ mod tests {
         let gain = |f: &FittedLaw| table.gain(&frame, &[*f], &[]) - f.law.parameters() as f64;
         let best = fits.into_iter().max_by(|a, b| gain(a).total_cmp(&gain(b))).unwrap();
         (best.law, best)
+    }
+
+    /// Improbability of laws with these numbers; infinite beyond their bounds.
+    fn within(table: &LossTable, laws: &[FittedLaw], numbers: &[f64]) -> f64 {
+        let mut bounds = laws.iter().flat_map(|l| l.law.bounds()).zip(numbers);
+        let inside = bounds.all(|([low, high], v)| (low..=high).contains(v));
+        if inside { table.improbability(&with_numbers(laws, numbers)) } else { f64::INFINITY }
+    }
+
+    #[test]
+    fn no_simplex_finds_more_probable_laws() {
+        let two = |r: f64, c: f64| 0.9 / ((1.0 + (0.12 / c).powi(3)) * (1.0 + (r / 60.0).powi(5)));
+        let tables =
+            [table(|r, c, z| two(r, c) * if z == 2 { 0.6 } else { 1.0 }), table(|r, c, _| (40.0 * c / r).min(1.0))];
+        for table in &tables {
+            for (law, before) in LAWS.into_iter().flat_map(|law| [(law, None), (law, Some(Law::Incidence))]) {
+                let before = before.map_or(vec![], |before| table.fit(&[], before));
+                let fit = table.fit(&before, law);
+                let found = table.improbability(&fit);
+                let numbers: Vec<f64> = fit.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec()).collect();
+                let value = |p: &[f64]| within(table, &fit, p);
+                let from_there = minimise(&numbers, &vec![0.01; numbers.len()], value).1;
+                assert!(found - from_there < 0.05, "{law:?} {found} {from_there} {fit:?}");
+                // From where the descent began as well.
+                let starts = law.starts(&table.used.iter().map(|&i| table.places[i]).collect::<Vec<_>>());
+                for start in starts {
+                    let laws: Vec<FittedLaw> = before.iter().copied().chain([start]).collect();
+                    let numbers: Vec<f64> = laws.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec()).collect();
+                    let value = |p: &[f64]| within(table, &laws, p);
+                    let steps = vec![0.3; numbers.len()];
+                    assert!(found - minimise(&numbers, &steps, value).1 < 0.5, "{law:?} {found}");
+                }
+            }
+        }
     }
 
     #[test]

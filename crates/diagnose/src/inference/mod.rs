@@ -3,6 +3,7 @@
 pub mod choice;
 pub mod comb;
 pub mod counts;
+mod descent;
 pub mod grouped;
 pub mod law;
 pub mod linear;

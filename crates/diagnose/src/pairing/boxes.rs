@@ -31,6 +31,13 @@ pub struct BoxShift {
 /// Prior standard deviation of a shift, m.
 const PRIOR_M: f64 = 1.0;
 
+/// Rounds of a fit: gate of the distance from the nearest surface point and scale of the weights, m.
+const GATES: [(f64, f64); 7] = [(1.2, 0.6), (1.0, 0.4), (0.8, 0.25), (0.6, 0.15), (0.5, 0.1), (0.4, 0.08), (0.4, 0.08)];
+
+/// First rounds, which only lead to where the last ones begin, and the most returns that they use.
+const COARSE: usize = 5;
+const COARSE_POINTS: usize = 150;
+
 /// Fits the shift that brings the simulated surfaces onto the measured returns: nearest surface point, distance
 /// across the surface, redescending weights, gates that narrow.
 pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoint]) -> Option<BoxShift> {
@@ -50,12 +57,13 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
     let points: Vec<Vector3<f64>> = measured.iter().map(|p| Vector3::from(bbox.to_local((*p).into()))).collect();
     let mut shift = Vector3::zeros();
     let mut result = None;
-    for (gate, scale) in [(1.2, 0.6), (1.0, 0.4), (0.8, 0.25), (0.6, 0.15), (0.5, 0.1), (0.4, 0.08), (0.4, 0.08)] {
+    for (round, (gate, scale)) in GATES.into_iter().enumerate() {
         let mut information = Matrix3::identity() / (PRIOR_M * PRIOR_M);
         let mut right = Vector3::zeros();
         let (mut used, mut squares) = (0usize, 0.0);
         let (mut system, mut of_size) = (Matrix3::zeros(), Matrix3::zeros());
-        for p in &points {
+        let every = if round < COARSE { points.len().div_ceil(COARSE_POINTS) } else { 1 };
+        for p in points.iter().step_by(every) {
             let back = p - shift;
             let nearest = surfaces.query(&back.into()).nearest_one::<SquaredEuclidean<f64>>().execute();
             let (q, n) = &local[nearest.item as usize];

@@ -172,7 +172,10 @@ impl DirectionIndex {
 
     fn axis(&self, k: usize, v: f32) -> i64 {
         let step = if k == 0 { self.window.azimuth_rad } else { self.window.elevation_rad };
-        ((v - self.low[k]) / step).floor() as i64
+        let at = (v - self.low[k]) / step;
+        // `floor` is a call where the processor may lack the instruction.
+        let whole = at as i64;
+        if whole as f32 > at { whole - 1 } else { whole }
     }
 
     fn cell(&self, az: f32, el: f32) -> usize {
