@@ -11,9 +11,9 @@ pub enum Odd {
     /// simulated return with another one beside it would not lie off a surface, and where both sides have many of them
     /// pairs would remain.
     Alone,
-    /// Grouped, in front of the surface or without one; not on objects.
+    /// Grouped, in front of the surface or without one; not on labelled objects nor so near that they belong to one.
     GroupInFront,
-    /// Grouped, behind the surface; not on objects.
+    /// Grouped, behind the surface; neither on labelled objects nor beside them.
     GroupBehind,
 }
 
@@ -46,7 +46,7 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
         Lies::Open if ray.row == u16::MAX => None,
         // What both sides show is lone on neither.
         _ if ray.company == 0 => (!ray.shown && (ray.smooth || lies == Lies::Open)).then_some(Odd::Alone),
-        _ if ray.company < FEW || ray.surface == Surface::Object => None,
+        _ if ray.company < FEW || ray.surface == Surface::Object || ray.at_object => None,
         Lies::Behind => Some(Odd::GroupBehind),
         _ => Some(Odd::GroupInFront),
     }
@@ -114,4 +114,20 @@ pub fn odd_frames(
             out
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    #[test]
+    fn a_group_beside_a_labelled_object_is_a_part_of_it() {
+        let before = Ray { residual_m: -3.0, ..Ray::standing(&Vector3::new(20.0, 0.0, 0.0)) };
+        assert_eq!(odd(&before), Some(Odd::GroupInFront));
+        assert_eq!(odd(&Ray { residual_m: 3.0, ..before }), Some(Odd::GroupBehind));
+        assert_eq!(odd(&Ray { at_object: true, ..before }), None);
+        assert_eq!(odd(&Ray { residual_m: 3.0, at_object: true, ..before }), None);
+        assert_eq!(odd(&Ray { company: 0, at_object: true, ..before }), Some(Odd::Alone));
+    }
 }

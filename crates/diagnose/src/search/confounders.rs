@@ -17,7 +17,7 @@ struct Confounder {
 }
 
 /// Confounders in the order in which they are applied: a finding that is dropped confounds nothing after it.
-const CONFOUNDERS: [Confounder; 17] = [
+const CONFOUNDERS: [Confounder; 16] = [
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
@@ -61,12 +61,6 @@ const CONFOUNDERS: [Confounder; 17] = [
         by: slide,
         share: 0.5,
         because: "returns that a scene that slides left alone",
-    },
-    Confounder {
-        effect: |f| f.is(Cause::MissingObject) && number(f, Quantity::Share) < FEW_THINGS,
-        by: shapes,
-        share: f64::INFINITY,
-        because: "parts of objects of another shape",
     },
     Confounder {
         effect: |f| f.is(Cause::MaterialDropout) && number(f, Quantity::Share) < 0.0,
@@ -118,9 +112,6 @@ const CONFOUNDERS: [Confounder; 17] = [
         because: "a part of what is off in a way without a name",
     },
 ];
-
-/// Share of returns below which grouped returns beside objects of another shape are parts of these objects.
-const FEW_THINGS: f64 = 0.004;
 
 /// Causes of single rows.
 const BEAM_CAUSES: [Cause; 3] = [Cause::BeamElevationOffset, Cause::BeamIntensity, Cause::BeamRangeOffset];
@@ -438,11 +429,7 @@ mod tests {
         let of_labels = Found { channel: Channel::Labels, ..about(-0.0006) };
         assert_eq!(left(vec![first(), of_labels]), [Cause::TimeOffset], "its size is not known, its presence is");
         assert_eq!(left(vec![first(), named(Cause::MissingObject, Channel::Returns, vec![])]), [Cause::MissingObject]);
-        let things =
-            |share: f64| named(Cause::MissingObject, Channel::Returns, vec![parameter(Quantity::Share, share, 0.0003)]);
         let shapes = || named(Cause::WrongShape, Channel::Objects, vec![]);
-        assert!(left(vec![shapes(), things(0.002)]).is_empty(), "parts of larger objects");
-        assert_eq!(left(vec![first(), things(0.002)]), [Cause::MissingObject]);
         let more = named(Cause::MaterialDropout, Channel::Hits, vec![parameter(Quantity::Share, -0.3, 0.01)]);
         assert!(left(vec![shapes(), more]).is_empty());
         let std_m = |value, error| vec![parameter(Quantity::StdM, value, error)];
