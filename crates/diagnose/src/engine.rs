@@ -12,8 +12,8 @@ mod verification;
 
 pub(crate) use reached::set_reached;
 pub(crate) use report::{refused, report};
+pub use verification::{Discrepancy, OnClouds, RemadeFrames, Remake, SEEDS, Switch, View, ViewState};
 pub(crate) use verification::{Distances, GainFrames, of_channels};
-pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::known::Known;
 use self::lacking::add_what_is_lacking;
@@ -33,8 +33,7 @@ use crate::pairing::{
     Corrections, FramePair, RangeError, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
     kept_of_frame, pair_all, with_points,
 };
-use crate::search::geometry::Displacement;
-use crate::search::geometry::Geometry;
+use crate::search::geometry::{Displacement, Geometry};
 use crate::search::labels::Side;
 use crate::search::quantisation::Rounded;
 use crate::search::returns::Scenes;
@@ -85,13 +84,15 @@ pub struct Outcome {
     pub corrected: Vec<(String, [Vec<Box3>; 3])>,
     /// The text of `extended.toml`.
     pub extended: String,
+    /// One frame with the findings applied and not; `None` where none of them changes it.
+    pub view: Option<View>,
 }
 
 impl Outcome {
     /// A diagnosis without findings.
     pub(crate) fn without_findings(diagnosis: Diagnosis) -> Self {
         let extended = extended_toml(&diagnosis, None);
-        Outcome { diagnosis, corrected: vec![], extended }
+        Outcome { diagnosis, corrected: vec![], extended, view: None }
     }
 }
 
@@ -314,12 +315,13 @@ impl Engine<'_> {
         let found = diagnosis.findings.iter().map(|f| f.channel).collect();
         let places = places_of(&diagnosis.findings, context.rig);
         let verification = Verification::new(self, &recorded, found, places);
+        let mut view = None;
         match extension {
-            Extension::Given(effects) => diagnosis.gain = verification.of(effects, remake)?.gain,
-            Extension::Found(_) => measure_gain(&mut diagnosis, &verification, &extended, remake)?,
+            Extension::Given(effects) => diagnosis.gain = verification.of(effects, &remake.with(effects)?)?.gain,
+            Extension::Found(_) => view = measure_gain(&mut diagnosis, &verification, &extended, remake)?,
         }
         (self.progress)(Stage::Verifying, 1, 1);
-        Ok(Outcome { diagnosis, corrected, extended })
+        Ok(Outcome { diagnosis, corrected, extended, view })
     }
 
     /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on

@@ -28,7 +28,8 @@ pub use diagnosis::{
     Unidentifiable, Verdict, Verification, json_forms,
 };
 pub use engine::{
-    OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
+    Discrepancy, OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, Switch, View, ViewState,
+    diagnose, diagnose_with, verify,
 };
 pub use error::DiagnoseError;
 pub use extended::{extended_toml, what_to_change};

@@ -128,7 +128,7 @@ pub fn diagnose_unpaired(
     }
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
     progress(Stage::Verifying, 1, 1);
-    Ok(Outcome { diagnosis, corrected: vec![], extended })
+    Ok(Outcome { diagnosis, corrected: vec![], extended, view: None })
 }
 
 /// The text of `extended.toml`; its gain goes into the diagnosis.

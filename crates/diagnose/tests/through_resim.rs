@@ -3,7 +3,8 @@
 
 use data::Dataset;
 use lidarshift_diagnose::{
-    Cause, Channel, Covariate, Diagnosis, Options, Outcome, Quantity, Rig, Status, Verdict, diagnose,
+    Cause, Channel, Covariate, Diagnosis, Discrepancy, Options, Outcome, Quantity, Rig, Status, Verdict, ViewState,
+    diagnose,
 };
 use sensor::EffectList;
 use simulate::race::{RaceConfig, make_race_datasets};
@@ -76,10 +77,34 @@ fn the_two_causes_of_the_paper_are_found_and_corrected() {
     assert!(closed > 0.95 && d.gain.not_applied.is_empty(), "{:?}", d.gain);
     let predicted = d.gain.predicted.as_ref().unwrap().closed.unwrap();
     assert!((predicted - closed).abs() < 0.05, "{:?}", d.gain);
+    switched(&outcome);
     // With the extended simulation there are no findings.
     let again = with_effects(&sim, &outcome.extended, &folder.path().join("extended"), 12);
     let outcome = diagnosed(&measured, &again, folder.path());
-    assert!(outcome.diagnosis.findings.is_empty(), "{:?}", outcome.diagnosis.findings);
+    assert!(outcome.diagnosis.findings.is_empty() && outcome.view.is_none(), "{:?}", outcome.diagnosis.findings);
+}
+
+/// In the frame that is shown, each of the two causes is seen where it is not applied, and gone where it is.
+fn switched(outcome: &Outcome) {
+    let view = outcome.view.as_ref().unwrap();
+    assert!(outcome.diagnosis.frames.hold_out.contains(&view.frame), "{}", view.frame);
+    let kinds: Vec<_> = view.switches.iter().map(|s| (s.finding.is_some(), s.discrepancy)).collect();
+    let of = |discrepancy| view.switches.iter().rfind(|s| s.discrepancy == discrepancy).unwrap();
+    assert!(kinds.len() == 3 && kinds[0] == (false, Discrepancy::Range), "{kinds:?}");
+    for switch in &view.switches {
+        assert_eq!([&switch.off, &switch.on].map(|state| state.values.len()), [view.points_m.len(); 2]);
+    }
+    let losses = of(Discrepancy::Range);
+    let [off, on] = [&losses.off, &losses.on].map(|state| state.lost_m.len());
+    assert!(off > view.points_m.len() / 8 && on < off / 3, "{off} {on} of {}", view.points_m.len());
+    let noise = of(Discrepancy::Scatter);
+    let median = |state: &ViewState| {
+        let mut values: Vec<f32> = state.values.iter().flatten().copied().collect();
+        values.sort_by(f32::total_cmp);
+        values[values.len() / 2]
+    };
+    let [off, on] = [&noise.off, &noise.on].map(median);
+    assert!((0.012..0.028).contains(&off) && on.abs() < 0.005, "{off} {on}");
 }
 
 /// Intensities by another law, and with a gain of each row: found with their parameters and corrected. Columns without

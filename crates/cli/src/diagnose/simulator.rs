@@ -92,4 +92,8 @@ impl RemadeFrames for Extended<'_> {
         let [one, other] = &self.draws;
         Ok([self.simulator.frame_of(one, id)?, self.simulator.frame_of(other, id)?])
     }
+
+    fn frame_with(&self, effects: &EffectList, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError> {
+        self.simulator.frame_of(&self.simulator.prepared(Some(effects), SEEDS[0]), id)
+    }
 }

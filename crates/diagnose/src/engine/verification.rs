@@ -5,6 +5,11 @@
 //! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero
 //! where the two sides are two draws of the same sensor, and is the same number before and after.
 
+mod view;
+
+pub use view::{Discrepancy, Switch, View, ViewState};
+
+use self::view::some;
 use super::reached::{Reached, closed_of, set_reached};
 use super::report::METRIC;
 use super::{Engine, curves};
@@ -38,6 +43,9 @@ const ENOUGH_NATS: f64 = 8.0;
 /// Random seeds of the two draws of the extended simulation.
 pub const SEEDS: [u64; 2] = [0, 1];
 
+/// Frames with effects, and those of the effects that cannot be applied.
+type Prepared<'a> = (Box<dyn RemadeFrames + 'a>, Vec<Refusal>);
+
 /// Makes frames of the simulation anew.
 pub trait Remake: Sync {
     /// Prepares frames with those of the effects that can be applied, and says which cannot.
@@ -54,6 +62,12 @@ pub trait RemadeFrames: Sync {
     /// # Errors
     /// Files that cannot be read, and frames that cannot be made.
     fn frame(&self, id: &str) -> Result<[(Cloud, Vec<Object>); 2], DiagnoseError>;
+
+    /// A frame for the first of [`SEEDS`], with `effects` in place of those that were prepared: some of them.
+    ///
+    /// # Errors
+    /// As above.
+    fn frame_with(&self, effects: &EffectList, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError>;
 }
 
 /// Applies effects to the finished clouds, as `lidarshift resim` does.
@@ -82,6 +96,11 @@ impl RemadeFrames for CloudsWith<'_> {
     fn frame(&self, id: &str) -> Result<[(Cloud, Vec<Object>); 2], DiagnoseError> {
         let frames = self.finished.frames(&self.effects, SEEDS, id)?;
         Ok(frames.map(|(frame, _)| (frame.cloud, frame.objects)))
+    }
+
+    fn frame_with(&self, effects: &EffectList, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError> {
+        let (frame, _) = self.finished.frame(effects, SEEDS[0], id)?;
+        Ok((frame.cloud, frame.objects))
     }
 }
 
@@ -148,12 +167,6 @@ fn distances(
     all
 }
 
-/// At most [`FRAMES`] of some frames, evenly spread.
-fn some(frames: Vec<usize>) -> Vec<usize> {
-    let n = frames.len();
-    if n <= FRAMES { frames } else { (0..FRAMES).map(|k| frames[k * n / FRAMES]).collect() }
-}
-
 /// A gain with the pairs of the extended simulation; no pairs where no effect could be applied.
 pub(super) struct Extended {
     pub(super) gain: Gain,
@@ -187,7 +200,7 @@ impl<'a> Verification<'a> {
         places: Places,
     ) -> Self {
         let slide = found.contains(&Channel::Slide);
-        let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role)));
+        let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role), FRAMES));
         let before = distances(context, engine.sensors, [&train, &test], slide, &places);
         Verification { engine, context, train, test, slide, found, places, before }
     }
@@ -197,14 +210,14 @@ impl<'a> Verification<'a> {
         Gain { before: 0.0, after: 0.0, floor: 0.0, counted: vec![], ..self.gain(&self.before, &self.before, false) }
     }
 
-    /// The gain by a list of effects.
+    /// The gain by a list of effects, which frames are prepared for.
     ///
     /// # Errors
     /// Files that cannot be read, and frames that cannot be made.
-    pub(super) fn of(&self, effects: &EffectList, remake: &dyn Remake) -> Result<Extended, DiagnoseError> {
-        let (made, refused) = remake.with(effects)?;
+    pub(super) fn of(&self, effects: &EffectList, (made, refused): &Prepared) -> Result<Extended, DiagnoseError> {
         let none_applied = refused.len() == effects.effects.len();
-        let not_applied = refused.into_iter().map(|r| NotApplied { effect: r.kind.into(), why: r.why }).collect();
+        let not_applied = |r: &Refusal| NotApplied { effect: r.kind.into(), why: r.why.clone() };
+        let not_applied = refused.iter().map(not_applied).collect();
         let zero: Distances = self.before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
         if none_applied {
             let gain = Gain { not_applied, ..self.gain(&self.before, &zero, true) };
@@ -361,23 +374,26 @@ impl GainFrames {
     }
 }
 
-/// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded.
+/// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded. Returns a
+/// view of it in one frame.
 pub(super) fn measure_gain(
     diagnosis: &mut Diagnosis,
     verification: &Verification,
     extended: &str,
     remake: &dyn Remake,
-) -> Result<(), DiagnoseError> {
-    let (gain, places) = match diagnosis.findings.is_empty() {
-        true => (verification.without_extension(), BTreeMap::new()),
+) -> Result<Option<View>, DiagnoseError> {
+    let (gain, places, view) = match diagnosis.findings.is_empty() {
+        true => (verification.without_extension(), BTreeMap::new(), None),
         false => {
             let effects = EffectList::parse(extended, Path::new("extended.toml"))?;
-            let extended = verification.of(&effects, remake)?;
+            let prepared = remake.with(&effects)?;
+            let extended = verification.of(&effects, &prepared)?;
             verification.measure_curves(&mut diagnosis.findings, &extended);
-            (extended.gain, extended.places)
+            let view = verification.view(&effects, &diagnosis.findings, &prepared)?;
+            (extended.gain, extended.places, view)
         }
     };
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
     set_reached(diagnosis, &places);
-    Ok(())
+    Ok(view)
 }

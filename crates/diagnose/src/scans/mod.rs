@@ -89,7 +89,7 @@ pub fn diagnose_scans(
     let contrasts = diagnosis.findings.iter_mut().filter(|f| f.cause == Some(Cause::BeamIntensity));
     contrasts.for_each(|f| f.effects.clear());
     let extended = extended_toml(&diagnosis, None);
-    Ok(Outcome { diagnosis, corrected: vec![], extended })
+    Ok(Outcome { diagnosis, corrected: vec![], extended, view: None })
 }
 
 /// The one sensor of a rig that stands at the origin of its clouds, unturned.

@@ -245,18 +245,22 @@ impl EffectList {
         EffectList { effects, ..self.clone() }
     }
 
-    /// The list with those effects alone that act on beams and scans: the sensor without the scene and the labels. The
-    /// others are replaced by one that changes nothing, so that the random numbers of the rest stay the same.
+    /// The list with those effects alone that act on beams and scans: the sensor without the scene and the labels.
     pub fn of_sensor(&self) -> EffectList {
         let ideal = WorldPlan::default();
-        let acts_elsewhere = |effect: &Effect| {
+        self.silencing(|effect| {
             let mut world = WorldPlan::default();
             effect.model().on_world(&mut world);
             world != ideal
                 || matches!(effect, Effect::LabelNoise(_) | Effect::LabelOffset(_) | Effect::LabelTimeOffset(_))
-        };
+        })
+    }
+
+    /// The list with some effects replaced by one that changes nothing, so that the random numbers of the rest stay
+    /// the same.
+    pub fn silencing(&self, which: impl Fn(&Effect) -> bool) -> EffectList {
         let neutral = || Effect::RangeBias(RangeBias::default());
-        let effect = |effect: &Effect| if acts_elsewhere(effect) { neutral() } else { effect.clone() };
+        let effect = |effect: &Effect| if which(effect) { neutral() } else { effect.clone() };
         EffectList { effects: self.effects.iter().map(effect).collect(), ..self.clone() }
     }
 
