@@ -12,14 +12,14 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::{REPAIRED_ENDINGS, write_kitti_text};
 use data::{DataError, Dataset, ErrorKind, FolderLock, LabelBox, write_atomic, write_json};
-use detectors::gain_of_detectors;
+use detectors::{STUDY, gain_of_detectors};
 use diagnose::{
     Cause, Diagnosis, OnClouds, Options, Outcome, Progress, Remake, Rig, Stage, Unidentifiable, Verdict, Verification,
     diagnose_scans, diagnose_unpaired, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use print::{print_diagnosis, print_gain, print_gains};
-use report::{DiagnosisReport, write_finding_pictures};
+use report::{DiagnosisReport, Link, write_finding_pictures};
 use sensor::EffectList;
 use simulate::race::RaceConfig;
 use simulator::RaceSimulator;
@@ -152,7 +152,7 @@ impl DiagnoseArgs {
         self.write_json(&outcome.diagnosis, !(with_detectors && self.json.is_stdout()))?;
         write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
-        self.write_page(&outcome.diagnosis)?;
+        self.write_page(&outcome, vec![])?;
         for (id, boxes) in &outcome.corrected {
             for (ending, boxes) in REPAIRED_ENDINGS.iter().zip(boxes) {
                 write_labels(&self.out.join(format!("{}{ending}", previous::LABELS)), measured, id, boxes)?;
@@ -169,7 +169,8 @@ impl DiagnoseArgs {
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis, true)?;
-            self.write_page(&outcome.diagnosis)?;
+            let of_study = Link::to_file(&self.out, &self.out.join(STUDY).join("report.html"), "The study of the detectors");
+            self.write_page(&outcome, of_study.into_iter().collect())?;
         }
         Ok(end_of(&outcome.diagnosis))
     }
@@ -273,10 +274,12 @@ impl DiagnoseArgs {
         Ok(())
     }
 
-    fn write_page(&self, diagnosis: &Diagnosis) -> Result<()> {
+    fn write_page(&self, outcome: &Outcome, links: Vec<Link>) -> Result<()> {
         let sets = [&self.measured, &self.simulated, &self.scans].into_iter().flatten();
         let names: Vec<String> = sets.map(|path| path.display().to_string()).collect();
-        let report = DiagnosisReport { diagnosis, title: names.join(" against "), command: called() };
+        let Outcome { diagnosis, view, .. } = outcome;
+        let title = names.join(" against ");
+        let report = DiagnosisReport { diagnosis, view: view.as_ref(), links, title, command: called() };
         Ok(report.write(&self.out)?)
     }
 

@@ -183,5 +183,5 @@ fn scene(id: u64) -> Scene {
         layer("simulated", "#d55e00", LayerContent::Cloud(simulated.cloud)),
     ];
     layers.extend((0..9).map(|k| layer(&format!("boxes {k}"), "#009e73", LayerContent::Boxes(boxes.clone()))));
-    Scene { name: format!("frame {id}"), layers, focus_m: Some(boxes[0].center) }
+    Scene { name: format!("frame {id}"), layers, focus_m: Some(boxes[0].center), ..Scene::default() }
 }

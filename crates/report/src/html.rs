@@ -2,6 +2,8 @@
 
 use crate::ReportError;
 use crate::figure::Figure;
+use crate::link::Link;
+use crate::scene::{Scene, scenes_json};
 use askama::Template;
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use eval::csv_text;
@@ -33,7 +35,18 @@ pub(crate) struct Item {
 pub(crate) enum Body {
     Figure { svg: String, wide: bool },
     Table { columns: Vec<String>, rows: Vec<TableRow>, text_columns: usize },
-    View { scenes_json: String },
+    View { scenes_json: String, texts: ViewTexts },
+}
+
+/// Texts around a 3D view.
+#[derive(Clone, Copy)]
+pub(crate) struct ViewTexts {
+    /// Before the list of scenes.
+    pub list: &'static str,
+    /// Beside the switch between the two states of a scene; `None` where scenes have one.
+    pub switch: Option<&'static str>,
+    /// The end of the sentence that stands there in browsers that cannot draw it.
+    pub without: &'static str,
 }
 
 /// A table row; `begins` draws a line above it.
@@ -99,8 +112,9 @@ impl Item {
         Item::new(id.into(), caption.into(), csv, Body::Table { columns, rows, text_columns })
     }
 
-    pub fn view(id: impl Into<String>, caption: impl Into<String>, scenes_json: String) -> Self {
-        Item::new(id.into(), caption.into(), String::new(), Body::View { scenes_json })
+    /// A 3D view of some scenes.
+    pub fn view(id: impl Into<String>, caption: impl Into<String>, scenes: &[Scene], texts: ViewTexts) -> Self {
+        Item::new(id.into(), caption.into(), String::new(), Body::View { scenes_json: scenes_json(scenes), texts })
     }
 
     fn new(id: String, caption: String, csv: String, body: Body) -> Self {
@@ -114,6 +128,7 @@ impl Item {
 struct PageTemplate<'a> {
     title: &'a str,
     about: &'a [String],
+    links: &'a [Link],
     warnings: &'a [String],
     sections: &'a [Section],
     footer: &'a str,
@@ -126,6 +141,7 @@ struct PageTemplate<'a> {
 pub(crate) struct PageText<'a> {
     pub title: &'a str,
     pub about: &'a [String],
+    pub links: &'a [Link],
     pub warnings: &'a [String],
     pub footer: &'a str,
 }
@@ -149,6 +165,7 @@ pub(crate) fn page(text: &PageText, sections: &mut [Section]) -> Result<String, 
     let template = PageTemplate {
         title: text.title,
         about: text.about,
+        links: text.links,
         warnings: text.warnings,
         sections,
         footer: text.footer,

@@ -7,6 +7,7 @@ mod birds_eye;
 mod curve;
 mod figure;
 mod html;
+mod link;
 mod page;
 mod pages;
 mod png;
@@ -18,10 +19,11 @@ mod tensorboard;
 pub use birds_eye::{BirdsEyeOptions, Style, birds_eye_png, birds_eye_svg};
 pub use curve::{CurveOptions, Series, curve_svg};
 pub use figure::*;
+pub use link::Link;
 pub use pages::comparison::ComparisonReport;
 pub use pages::diagnosis::{DiagnosisReport, finding_name, write_finding_pictures};
 pub use pages::study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
-pub use scene::{Layer, LayerContent, Scene};
+pub use scene::{ColoredCloud, Layer, LayerContent, Scene};
 
 pub use tensorboard::write_event_files;
 

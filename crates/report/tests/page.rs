@@ -1,6 +1,7 @@
 //! Tests of the complete report of a study: the self-contained page and its files.
 
 use data::{Cloud, Detection, Frame, LabelBox, LabelFrame, Object, stream};
+use diagnose::{Diagnosis, Discrepancy, Switch, Verdict, View, ViewState};
 use eval::analysis::{AnalysisOptions, BoxPoints, analyse};
 use eval::distance::{DistanceOptions, Regions, compare};
 use eval::features::{CkaTable, Embedded, Embedding, TSNE_SCHEMA, TsneOptions};
@@ -10,7 +11,7 @@ use eval::matrix::{
 use eval::targets::{TargetOptions, targets};
 use eval::{BootstrapOptions, EvalFrame};
 use geometry::Box3;
-use lidarshift_report::{FrechetRow, Layer, LayerContent, Scene, StudyReport, TrainingRun};
+use lidarshift_report::{DiagnosisReport, FrechetRow, Layer, LayerContent, Link, Scene, StudyReport, TrainingRun};
 use rand::RngExt;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -191,11 +192,13 @@ fn report() -> StudyReport {
             layer("labels", "#009e73", LayerContent::Boxes(vec![shown.objects[0].bbox])),
             layer("detections", "#cc79a7", LayerContent::Boxes(found(&shown, 1, 0.5).iter().map(|d| d.bbox).collect())),
         ],
+        on: None,
     };
     let layers = ["vfe", "block 1", "block 2", "head"].map(String::from).to_vec();
     StudyReport {
         title: "A study of <made up> data".into(),
         about: vec!["Everything here is made up for a test of the page; no network was trained.".into()],
+        links: vec![Link { text: "The <diagnosis>".into(), href: "../found/report.html?\"".into() }],
         command: "cargo test -p lidarshift-report".into(),
         facts: vec![("seeds".into(), "1, 2, 3".into()), ("machine".into(), "two cores".into())],
         warnings: vec![],
@@ -275,6 +278,54 @@ fn in_browser(page: &Path, more: &[&str]) -> Option<String> {
     Some(String::from_utf8_lossy(&out.stdout).into_owned())
 }
 
+/// A page of a diagnosis with one frame in 3D, whose second finding is chosen by a script and switched off.
+#[test]
+fn findings_are_switched_in_a_browser() {
+    let state = |value: f32| ViewState { values: vec![Some(value), None], lost_m: vec![[3.0; 3]] };
+    let [off, on] = [0.19, 0.0].map(state);
+    let of_ranges = Switch { finding: None, discrepancy: Discrepancy::Range, off, on };
+    let of_scatter = Switch { discrepancy: Discrepancy::Scatter, ..of_ranges.clone() };
+    let switches = vec![of_ranges, of_scatter];
+    let view = View { frame: "000007".into(), points_m: vec![[1.0; 3], [2.0; 3]], switches };
+    let diagnosis = Diagnosis {
+        schema: diagnose::SCHEMA.into(),
+        build: String::new(),
+        verdict: Verdict::NothingFound,
+        frames: Default::default(),
+        findings: vec![],
+        minimum_detectable: Default::default(),
+        gain: Default::default(),
+        detectors: vec![],
+        not_identifiable: vec![],
+        considered: vec![],
+        notes: vec![],
+    };
+    let report = DiagnosisReport {
+        diagnosis: &diagnosis,
+        view: Some(&view),
+        links: vec![],
+        title: "a against b".into(),
+        command: String::new(),
+    };
+    let change = "<script>for (const [at, key, value] of [['select', 'value', 1], ['.switch input', 'checked', false]]) {\
+                  const found = document.querySelector('.viewer ' + at); found[key] = value;\
+                  found.dispatchEvent(new Event('change')); }</script></body>";
+    let html = report.html().unwrap();
+    for (number, (html, end, checkboxes)) in
+        [(html.clone(), "0.2 m farther than simulated", 3), (html.replace("</body>", change), "scatter 0.2 m less", 2)]
+            .into_iter()
+            .enumerate()
+    {
+        let page = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("diagnosis-{number}.html"));
+        std::fs::write(&page, html).unwrap();
+        let Some(dom) = in_browser(&page, &["--dump-dom"]) else { return };
+        assert_eq!(dom.matches("All findings</option>").count(), 2, "the list has both");
+        assert_eq!(dom.matches("<input type=\"checkbox\"").count(), checkboxes, "the switch and the layers");
+        assert!(dom.contains(end) && dom.contains("linear-gradient(to right, rgb("), "{end}");
+        assert!(!dom.contains("class=\"viewer no-webgl\""), "WebGL by SwiftShader");
+    }
+}
+
 #[test]
 fn the_page_is_whole_and_needs_nothing() {
     let (page, html) = written();
@@ -296,6 +347,7 @@ fn the_page_is_whole_and_needs_nothing() {
     }
     // Content that must not be missing.
     for part in [
+        "<a href=\"../found/report.html?&#34;\">The &#60;diagnosis&#62;</a>",
         "is of another configuration",
         "seed 2 is missing",
         "0 of 2",

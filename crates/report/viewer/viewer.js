@@ -5,10 +5,15 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
+const bytes = (base64) => Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+
 // Positions are whole centimetres, little-endian int16, x y z of each point (LiDAR frame).
-function positions(base64) {
-  const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
-  return Float32Array.from(new Int16Array(bytes.buffer), (v) => v / 100);
+const positions = (base64) => Float32Array.from(new Int16Array(bytes(base64).buffer), (v) => v / 100);
+
+// The colour of each point is a byte: its number in the palette.
+function colors(base64, palette) {
+  const rgb = palette.map((css) => new Color(css)).map(({ r, g, b }) => [r, g, b]);
+  return Float32Array.from(Array.from(bytes(base64), (number) => rgb[number]).flat());
 }
 
 // Edges of a box [x, y, z, dx, dy, dz, yaw], and a tick out of its front.
@@ -22,7 +27,7 @@ function edges([x, y, z, dx, dy, dz, yaw]) {
   return out;
 }
 
-function view(root, data) {
+function view(root, { blobs, scenes }) {
   const canvas = root.querySelector("canvas");
   let renderer;
   try {
@@ -37,6 +42,7 @@ function view(root, data) {
   const controls = new OrbitControls(camera, canvas);
   controls.listenToKeyEvents(canvas);
   let shown = [];
+  const hidden = new Set();
   let asked = false;
   const draw = () => {
     asked = false;
@@ -54,18 +60,23 @@ function view(root, data) {
   };
   const ask = () => { if (!asked) { asked = true; requestAnimationFrame(draw); } };
   const layers = root.querySelector(".layers");
-  const open = (index) => {
-    const frame = data[index];
+  const applied = root.querySelector(".switch input");
+  const open = () => {
+    const frame = scenes[select.value | 0];
     for (const { object } of shown) { scene.remove(object); object.geometry.dispose(); object.material.dispose(); }
-    shown = frame.layers.map((layer) => {
+    shown = ((applied?.checked && frame.on) || frame.layers).map((layer) => {
       const geometry = new BufferGeometry();
-      const at = layer.points !== undefined ? positions(layer.points) : new Float32Array(layer.boxes.flatMap(edges));
+      const isCloud = layer.points !== undefined;
+      const at = isCloud ? positions(blobs[layer.points]) : new Float32Array(layer.boxes.flatMap(edges));
       geometry.setAttribute("position", new BufferAttribute(at, 3));
-      const color = new Color(layer.color);
-      const object = layer.points !== undefined
-        ? new Points(geometry, new PointsMaterial({ color, size: 2, sizeAttenuation: false }))
+      const vertexColors = layer.colors !== undefined;
+      if (vertexColors) geometry.setAttribute("color", new BufferAttribute(colors(blobs[layer.colors], layer.palette), 3));
+      const color = new Color(vertexColors ? "#ffffff" : layer.color);
+      const object = isCloud
+        ? new Points(geometry, new PointsMaterial({ color, vertexColors, size: 2, sizeAttenuation: false }))
         : new LineSegments(geometry, new LineBasicMaterial({ color }));
       object.frustumCulled = false;
+      object.visible = !hidden.has(layer.name);
       scene.add(object);
       return { object, layer };
     });
@@ -73,37 +84,46 @@ function view(root, data) {
       const label = document.createElement("label");
       const box = document.createElement("input");
       box.type = "checkbox";
-      box.checked = true;
-      box.addEventListener("change", () => { object.visible = box.checked; ask(); });
-      const swatch = document.createElement("span");
-      swatch.className = "swatch";
-      swatch.style.background = layer.color;
-      label.append(box, swatch, layer.name);
+      box.checked = object.visible;
+      box.addEventListener("change", () => {
+        object.visible = box.checked;
+        if (box.checked) hidden.delete(layer.name); else hidden.add(layer.name);
+        ask();
+      });
+      label.append(box);
+      for (const [background, text] of layer.legend ?? [[layer.color, layer.name]]) {
+        const swatch = document.createElement("span");
+        swatch.className = background.startsWith("#") ? "swatch" : "swatch scale";
+        swatch.style.background = background;
+        label.append(...background ? [swatch, text] : [text]);
+      }
       return label;
     }));
     ask();
   };
   const look = (from, at) => { camera.position.set(...from); controls.target = new Vector3(...at); ask(); };
-  const target = () => data[select.value | 0].focus ?? [0, 0, 0];
+  const target = () => scenes[select.value | 0].focus ?? [0, 0, 0];
   const places = {
     behind: () => look([-28, 0, 16], [12, 0, 0]),
     above: () => look([0, -0.1, 130], [0, 0, 0]),
     target: () => { const [x, y, z] = target(); look([x - 7, y - 7, z + 5], [x, y, z]); },
   };
   const select = root.querySelector("select");
-  data.forEach((frame, i) => select.append(new Option(frame.name, i)));
-  select.addEventListener("change", () => open(select.value | 0));
+  scenes.forEach((frame, i) => select.append(new Option(frame.name, i)));
+  select.addEventListener("change", open);
+  applied?.addEventListener("change", open);
   for (const button of root.querySelectorAll("button[data-view]")) {
     button.addEventListener("click", () => places[button.dataset.view]());
+    button.hidden = button.dataset.view === "target" && scenes.every((frame) => !frame.focus);
   }
   controls.addEventListener("change", ask);
   new ResizeObserver(ask).observe(canvas);
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", ask);
-  open(0);
+  open();
   places.behind();
 }
 
 for (const root of document.querySelectorAll(".viewer")) {
   const data = JSON.parse(document.getElementById(root.dataset.scene).textContent);
-  if (data.length) view(root, data);
+  if (data.scenes.length) view(root, data);
 }

@@ -13,7 +13,7 @@ use data::Presence as _;
 use eval::detections_of;
 use eval::matrix::{Matrix, PairedDifference, Quantity, TestSet, shared_ids};
 use geometry::Box3;
-use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
+use report::{Layer, LayerContent, Link, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
 use std::path::PathBuf;
 
 /// Number of test frames in the 3D view.
@@ -53,6 +53,7 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
     let report = StudyReport {
         title: format!("lidarshift study: {}", study.config.name),
         about: study.config.about.clone(),
+        links: diagnoses(study),
         command: format!("lidarshift study {}", study.named),
         facts: facts(study)?,
         warnings,
@@ -191,6 +192,19 @@ fn source(study: &Study, dataset: &StudyDataset) -> String {
     }
 }
 
+/// Links to the pages of the diagnoses that made the effects of data sets: those that stand beside these.
+fn diagnoses(study: &Study) -> Vec<Link> {
+    let of_set = |set: &StudyDataset| {
+        let Source::Resim { effects, .. } = &set.source else { return None };
+        let [page, numbers] = ["report.html", "diagnosis.json"].map(|name| study.path(effects).with_file_name(name));
+        // Studies have a `report.html` as well.
+        let is_diagnosis = page.may_be_file() && numbers.may_be_file();
+        let text = format!("The diagnosis that made the effects of {}", set.title);
+        is_diagnosis.then(|| Link::to_file(&study.folder, &page, &text)).flatten()
+    };
+    study.config.datasets.iter().filter_map(of_set).collect()
+}
+
 /// Training curves of all runs that have started.
 fn training(study: &Study) -> Result<Vec<TrainingRun>> {
     let mut out = Vec::new();
@@ -257,11 +271,40 @@ fn scenes(study: &Study, state: &StudyState) -> Result<Vec<Scene>> {
                 layers.push(layer(&name, color, LayerContent::Boxes(boxes)));
             }
         }
-        scenes.push(Scene { name: format!("{}, frame {id}", study.title(names[0])), layers, focus_m });
+        scenes.push(Scene { name: format!("{}, frame {id}", study.title(names[0])), layers, focus_m, on: None });
     }
     Ok(scenes)
 }
 
 fn layer(name: &str, color: &str, content: LayerContent) -> Layer {
     Layer { name: name.into(), color: color.into(), content }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_study_links_the_diagnosis_beside_its_effects() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = "name = \"s\"\nabout = []\nseeds = [1]\nepochs = 1\n\
+                    [[dataset]]\nname = \"real\"\ntitle = \"Real\"\nsource = { path = \"real\" }\n\
+                    [[dataset]]\nname = \"sim\"\ntitle = \"Sim\"\nsource = { path = \"sim\" }\n\
+                    [[dataset]]\nname = \"more\"\ntitle = \"Sim & more\"\n\
+                    source = { resim = { of = \"sim\", effects = \"found/extended.toml\" } }\n\
+                    [[detector]]\nname = \"pointpillars_small\"\ntitle = \"PointPillars\"\n";
+        let [path, found] = ["s.toml", "found"].map(|name| folder.path().join(name));
+        fs_err::write(&path, text).unwrap();
+        fs_err::create_dir(&found).unwrap();
+        let study = Study::open(path.to_str().unwrap(), Some(&folder.path().join("runs/s"))).unwrap();
+        fs_err::write(found.join("report.html"), "").unwrap();
+        assert!(diagnoses(&study).is_empty(), "the page of something else");
+        fs_err::write(found.join("diagnosis.json"), "{}").unwrap();
+        let links = diagnoses(&study);
+        let hrefs: Vec<&str> = links.iter().map(|link| link.href.as_str()).collect();
+        assert_eq!(hrefs, ["../../found/report.html"]);
+        let page = StudyReport { links, ..StudyReport::default() }.html().unwrap();
+        let link = "<a href=\"../../found/report.html\">The diagnosis that made the effects of Sim &#38; more</a>";
+        assert!(page.contains(link), "the page has no {link}");
+    }
 }

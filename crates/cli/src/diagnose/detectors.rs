@@ -15,6 +15,9 @@ use std::path::{Path, PathBuf};
 use study::numbers::{StudyState, matrix};
 use study::{RunOptions, Source, Study, StudyConfig, StudyDataset};
 
+/// Folder of the study in that of the diagnosis.
+pub(super) const STUDY: &str = "detectors";
+
 const MEASURED: &str = "measured";
 const BEFORE: &str = "simulated";
 const AFTER: &str = "extended";
@@ -40,7 +43,7 @@ pub(super) fn gain_of_detectors(
     let Some(path) = path.to_str() else {
         bail!("--out {}: with --detectors the path has to be UTF-8", out.display());
     };
-    let study = Study::open(path, Some(&out.join("detectors")))?;
+    let study = Study::open(path, Some(&out.join(STUDY)))?;
     run_study(&study, &RunOptions::here(DeviceArgs::default().arguments()), &JsonArgs::default())?;
     Ok((gains(&matrix(&study, &StudyState::read(&study)?)?)?, left_out))
 }

@@ -40,7 +40,10 @@ impl ComparisonReport<'_> {
         )];
         let footer = format!("Made by: {}. One file: figures and numbers are inside; nothing is loaded.", self.command);
         let title = format!("lidarshift compare: {}", c.measured);
-        page(&PageText { title: &title, about: &about, warnings: &c.warnings, footer: &footer }, &mut sections)
+        page(
+            &PageText { title: &title, about: &about, links: &[], warnings: &c.warnings, footer: &footer },
+            &mut sections,
+        )
     }
 
     /// Writes `comparison.html` into a folder.

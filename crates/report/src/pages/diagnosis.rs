@@ -2,6 +2,7 @@
 //! of a diagnosis.
 
 mod page;
+mod view;
 
 pub use page::DiagnosisReport;
 

@@ -11,8 +11,9 @@ pub(crate) use training::metrics_lines;
 pub use training::{TrainingRun, read_training_run};
 
 use crate::ReportError;
-use crate::html::{Item, PageText, Section, page};
-use crate::scene::{Scene, scenes_json};
+use crate::html::{Item, PageText, Section, ViewTexts, page};
+use crate::link::Link;
+use crate::scene::Scene;
 use data::output::remove_unfinished;
 use data::{FolderLock, write_atomic};
 use eval::analysis::RunAnalysis;
@@ -32,6 +33,8 @@ pub struct StudyReport {
     pub title: String,
     /// Paragraphs: what the study is, how it is scaled down from the paper, and what was compared.
     pub about: Vec<String>,
+    /// Other pages about the same data.
+    pub links: Vec<Link>,
     /// The command that reproduces this report.
     pub command: String,
     /// Name and value of each fact: seeds, machine, versions, times.
@@ -153,7 +156,8 @@ impl StudyReport {
                 "Made by: {command}. One file: figures, numbers and the view of clouds are inside; nothing is loaded."
             ),
         };
-        page(&PageText { title: &self.title, about: &self.about, warnings: &warnings, footer: &footer }, sections)
+        let Self { title, about, links, .. } = self;
+        page(&PageText { title, about, links, warnings: &warnings, footer: &footer }, sections)
     }
 
     fn sections(&self) -> Vec<Section> {
@@ -186,13 +190,15 @@ impl StudyReport {
     }
 
     fn scene_section(&self) -> Section {
+        let texts = ViewTexts { list: "Frame", switch: None, without: "; the figures above show the same clouds" };
         let items = match self.scenes.is_empty() {
             true => Vec::new(),
             false => vec![Item::view(
                 "scenes",
                 "Clouds with boxes. Drag to turn, scroll or pinch to come nearer, drag with the right button or two fingers to move. The \
                  line out of a box shows its front. Positions are rounded to whole centimetres.",
-                scenes_json(&self.scenes),
+                &self.scenes,
+                texts,
             )],
         };
         Section { id: "clouds-3d", title: "Clouds and boxes", text: Vec::new(), items }

@@ -1,12 +1,13 @@
-//! The page of a diagnosis: the result in three sentences, the findings with what to change, a figure of each, the gain
-//! by channel, and what was looked for and not found.
+//! The page of a diagnosis: the result in three sentences, the findings with what to change, a figure of each, one
+//! frame in 3D, the gain by channel, and what was looked for and not found.
 
-use super::{figure, finding_name};
+use super::{figure, finding_name, view};
 use crate::ReportError;
 use crate::html::{Item, PageText, Section, TableCell, TableRow, page};
+use crate::link::Link;
 use crate::pages::study::number;
 use data::write_atomic;
-use diagnose::{Diagnosis, Finding, ParameterId, Status, Unit, Verdict, what_to_change};
+use diagnose::{Diagnosis, Finding, ParameterId, Status, Unit, Verdict, View, what_to_change};
 use std::path::Path;
 
 /// Content of the page.
@@ -14,6 +15,10 @@ use std::path::Path;
 pub struct DiagnosisReport<'a> {
     /// The diagnosis.
     pub diagnosis: &'a Diagnosis,
+    /// One frame with findings applied and not.
+    pub view: Option<&'a View>,
+    /// Other pages about the same data.
+    pub links: Vec<Link>,
     /// What was compared: names of the measured and of the simulated data set.
     pub title: String,
     /// The command that made it.
@@ -27,8 +32,10 @@ impl DiagnosisReport<'_> {
     /// A page that cannot be rendered.
     pub fn html(&self) -> Result<String, ReportError> {
         let d = self.diagnosis;
+        let [found, figures, frame] = [findings(d), pictures(d), view::section(d, self.view)];
+        let [gone, detectors] = [gain(d), detectors(d)];
         let mut sections =
-            vec![findings(d), pictures(d), gain(d), detectors(d), not_found(d), not_identifiable(d), considered(d)];
+            vec![found, figures, frame, gone, detectors, not_found(d), not_identifiable(d), considered(d)];
         sections.retain(|section| !section.items.is_empty());
         let left =
             d.gain.not_applied.iter().map(|n| format!("Not applied, and counted as not gone: {}: {}", n.effect, n.why));
@@ -37,7 +44,8 @@ impl DiagnosisReport<'_> {
         let footer =
             format!("Made by: {}{build}. One file: figures and numbers are inside; nothing is loaded.", self.command);
         let title = format!("lidarshift diagnose: {}", self.title);
-        page(&PageText { title: &title, about: &about(d), warnings: &warnings, footer: &footer }, &mut sections)
+        let (about, links) = (&about(d)[..], &self.links[..]);
+        page(&PageText { title: &title, about, links, warnings: &warnings, footer: &footer }, &mut sections)
     }
 
     /// Writes `report.html` into a folder.
@@ -278,12 +286,13 @@ fn considered(d: &Diagnosis) -> Section {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::tests::loss_by_row;
+    use super::super::view::tests::switch;
     use super::*;
-    use diagnose::{Cause, Gain, Minimum, Parameter, Quantity, Unidentifiable};
+    use diagnose::{Cause, Discrepancy, Gain, Minimum, Parameter, Quantity, Unidentifiable};
 
-    fn diagnosis(findings: Vec<Finding>) -> Diagnosis {
+    pub(crate) fn diagnosis(findings: Vec<Finding>) -> Diagnosis {
         Diagnosis {
             schema: diagnose::SCHEMA.into(),
             build: "0.1.0+abc".into(),
@@ -304,7 +313,13 @@ mod tests {
     }
 
     fn html(diagnosis: &Diagnosis) -> String {
-        DiagnosisReport { diagnosis, title: "a against b".into(), command: "lidarshift".into() }.html().unwrap()
+        page_of(diagnosis, None, vec![])
+    }
+
+    fn page_of(diagnosis: &Diagnosis, view: Option<&View>, links: Vec<Link>) -> String {
+        DiagnosisReport { diagnosis, view, links, title: "a against b".into(), command: "lidarshift".into() }
+            .html()
+            .unwrap()
     }
 
     #[test]
@@ -329,6 +344,34 @@ mod tests {
             assert!(page.contains(words), "{words}\n{page}");
         }
         assert!(!page.contains("src=\"") && !page.contains("href=\"http"), "nothing is loaded");
+    }
+
+    #[test]
+    fn a_page_has_one_frame_in_3d_behind_the_figures_and_links() {
+        let d = diagnosis(vec![loss_by_row(), loss_by_row()]);
+        let one = switch(Discrepancy::Range, &[Some(0.3), None]);
+        let switches = vec![diagnose::Switch { finding: None, ..one.clone() }, one];
+        let view = View { frame: "<7>".into(), points_m: vec![[1.0, 2.0, 3.0]; 2], switches };
+        let link = Link { text: "The study <of detectors>".into(), href: "detectors/report.html".into() };
+        let page = page_of(&d, Some(&view), vec![link]);
+        let at = |words: &str| page.find(words).unwrap_or_else(|| panic!("{words}"));
+        assert!(at("<h2>Each finding, before and after") < at("<h2>One frame in 3D"));
+        assert!(at("<h2>One frame in 3D") < at("<h2>What was not found"));
+        for words in [
+            "The measured frame &#60;7&#62;: of the frames on which nothing was fitted",
+            "Choose a finding and switch it off and on",
+            "<label class=\"switch\"><input type=\"checkbox\" checked> applied to the simulation</label>",
+            "which this browser does not offer; the figures above show every finding before and after.",
+            "\"name\":\"All findings\"",
+            "\"name\":\"1. unexplained\"",
+            "<a href=\"detectors/report.html\">The study &#60;of detectors&#62;</a>",
+        ] {
+            at(words);
+        }
+        let one = View { switches: view.switches[1..].to_vec(), ..view };
+        assert!(page_of(&d, Some(&one), vec![]).contains("off is the simulation as it is"));
+        let without = html(&d);
+        assert!(!without.contains("One frame in 3D") && !without.contains("class=\"viewer\""));
     }
 
     #[test]
