@@ -36,7 +36,7 @@ impl Slopes {
 /// Most steps.
 const STEPS: usize = 200;
 
-/// A step that lowers the value by less is the last but for `SMALL_STEPS` more.
+/// A step that lowers the value by less is small.
 const SMALL: f64 = 1e-5;
 
 /// Small steps in a row after which the search ends.
