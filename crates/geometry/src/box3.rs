@@ -54,6 +54,14 @@ impl Box3 {
         [x * c + y * s, -x * s + y * c, p[2] - self.center[2]]
     }
 
+    /// Whether a point is certainly farther than a margin from the box, seen from above, m. Most points are far from
+    /// most boxes, and this asks for no turn.
+    pub fn is_far(&self, p: [f64; 3], margin_m: f64) -> bool {
+        let (x, y) = (p[0] - self.center[0], p[1] - self.center[1]);
+        let reach_m = 0.5 * (self.size[0] + self.size[1]) + 2.0 * margin_m;
+        x * x + y * y > reach_m * reach_m
+    }
+
     /// A point of the box's own frame in the outer frame; the inverse of [`Box3::to_local`].
     pub fn from_local(&self, p: [f64; 3]) -> [f64; 3] {
         let (s, c) = self.yaw_rad.sin_cos();
@@ -104,6 +112,15 @@ pub fn limit_period(v: f64, offset: f64, period: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_beside_a_box_is_not_far() {
+        let b = Box3::from_array([10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.6]);
+        for corner in [[2.4, 1.4, 0.0], [-2.4, 1.4, 0.0], [2.4, -1.4, 0.0], [-2.4, -1.4, 0.0]] {
+            assert!(!b.is_far(b.from_local(corner), 0.4));
+        }
+        assert!(b.is_far([14.0, 0.0, 1.0], 0.4) && b.is_far([10.0, -4.0, 1.0], 0.0));
+    }
 
     #[test]
     fn a_ray_passes_through_a_turned_box_up_to_where_it_ends() {

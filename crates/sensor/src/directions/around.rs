@@ -33,10 +33,7 @@ const LEVEL: f64 = 0.85;
 
 /// Whether a point lies in a box or within a margin beside it, above the ground.
 pub fn in_or_beside(bbox: &Box3, point: [f64; 3], margin_m: f64) -> bool {
-    let (x, y) = (point[0] - bbox.center[0], point[1] - bbox.center[1]);
-    // Most points are far from most boxes.
-    let reach_m = 0.5 * (bbox.size[0] + bbox.size[1]) + 2.0 * margin_m;
-    if x * x + y * y > reach_m * reach_m {
+    if bbox.is_far(point, margin_m) {
         return false;
     }
     let local = bbox.to_local(point);

@@ -37,12 +37,11 @@ impl Motion {
     pub(super) fn at(&self, point: &Vector3<f64>, longest_s: f64) -> Vector3<f64> {
         let on = |(b, v): &&(Box3, Vector3<f64>)| {
             let margin = 0.5 + 0.5 * v.norm() * longest_s;
-            // Most points are far from most boxes.
-            let reach_m = 0.5 * (b.size[0] + b.size[1]) + 2.0 * margin;
-            if (point.x - b.center[0]).hypot(point.y - b.center[1]) > reach_m {
+            let point = (*point).into();
+            if b.is_far(point, margin) {
                 return false;
             }
-            let local = b.to_local((*point).into());
+            let local = b.to_local(point);
             (0..2).all(|k| local[k].abs() < b.size[k] / 2.0 + margin) && local[2].abs() < b.size[2] / 2.0 + 0.3
         };
         match self.objects.iter().find(on) {
