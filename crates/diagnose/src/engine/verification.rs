@@ -9,7 +9,6 @@ mod view;
 
 pub use view::{Discrepancy, Switch, View, ViewState};
 
-use self::view::some;
 use super::reached::{Reached, closed_of, set_reached};
 use super::report::METRIC;
 use super::{Engine, curves};
@@ -17,6 +16,7 @@ use crate::catalogue::{Channel, Kind};
 use crate::channels::mask::DirectionCell;
 use crate::diagnosis::{Closed, Diagnosis, Finding, Gain, NotApplied};
 use crate::error::DiagnoseError;
+use crate::inference::evenly_spread;
 use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
@@ -200,7 +200,7 @@ impl<'a> Verification<'a> {
         places: Places,
     ) -> Self {
         let slide = found.contains(&Channel::Slide);
-        let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role), FRAMES));
+        let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| evenly_spread(&context.of(role), FRAMES));
         let before = distances(context, engine.sensors, [&train, &test], slide, &places);
         Verification { engine, context, train, test, slide, found, places, before }
     }

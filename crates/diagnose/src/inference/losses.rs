@@ -105,8 +105,7 @@ impl LossTable {
         let places: Vec<Where> = self.used.iter().map(|&i| self.places[i]).collect();
         let from = |start: FittedLaw| {
             let laws: Vec<FittedLaw> = before.iter().copied().chain([start]).collect();
-            let numbers = laws.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec());
-            let start = DVector::from_vec(numbers.collect());
+            let start = DVector::from_vec(numbers_of(&laws));
             let bounds: Vec<[f64; 2]> = laws.iter().flat_map(|l| l.law.bounds()).collect();
             let with = |p: &DVector<f64>| with_numbers(&laws, p.as_slice());
             let (at, least) = descend(start, &bounds, |p| self.improbability(&with(p)), |p| self.slopes(&with(p)));
@@ -348,6 +347,12 @@ impl Slopes {
     }
 }
 
+/// The numbers of some laws, one after the other.
+fn numbers_of(laws: &[FittedLaw]) -> Vec<f64> {
+    laws.iter().flat_map(|l| &l.numbers[..l.law.count()]).copied().collect()
+}
+
+/// Laws with other numbers, in the order of [`numbers_of`].
 fn with_numbers(laws: &[FittedLaw], numbers: &[f64]) -> Vec<FittedLaw> {
     let mut at = 0;
     laws.iter()
@@ -416,7 +421,7 @@ mod tests {
                 let before = before.map_or(vec![], |before| table.fit(&[], before));
                 let fit = table.fit(&before, law);
                 let found = table.improbability(&fit);
-                let numbers: Vec<f64> = fit.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec()).collect();
+                let numbers = numbers_of(&fit);
                 let value = |p: &[f64]| within(table, &fit, p);
                 let from_there = minimise(&numbers, &vec![0.01; numbers.len()], value).1;
                 assert!(found - from_there < 0.05, "{law:?} {found} {from_there} {fit:?}");
@@ -424,7 +429,7 @@ mod tests {
                 let starts = law.starts(&table.used.iter().map(|&i| table.places[i]).collect::<Vec<_>>());
                 for start in starts {
                     let laws: Vec<FittedLaw> = before.iter().copied().chain([start]).collect();
-                    let numbers: Vec<f64> = laws.iter().flat_map(|l| l.numbers[..l.law.count()].to_vec()).collect();
+                    let numbers = numbers_of(&laws);
                     let value = |p: &[f64]| within(table, &laws, p);
                     let steps = vec![0.3; numbers.len()];
                     assert!(found - minimise(&numbers, &steps, value).1 < 0.5, "{law:?} {found}");

@@ -21,6 +21,12 @@ pub fn bisect([mut low, mut high]: [f64; 2], times: usize, holds: impl Fn(f64) -
     0.5 * (low + high)
 }
 
+/// At most so many of some items, evenly spread.
+pub fn evenly_spread<T: Clone>(items: &[T], most: usize) -> Vec<T> {
+    let (n, kept) = (items.len(), items.len().min(most));
+    (0..kept).map(|k| items[k * n / kept].clone()).collect()
+}
+
 /// Median of some values, the upper one of the two in the middle; 0 of none.
 pub fn median(values: Vec<f64>) -> f64 {
     statistics::median_upper(values).unwrap_or(0.0)

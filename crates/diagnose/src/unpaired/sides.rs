@@ -3,6 +3,7 @@
 use crate::channels::mask::{DirectionCell, direction_cell, neighbours};
 use crate::channels::returns::OWN_CAR_M;
 use crate::error::DiagnoseError;
+use crate::inference::evenly_spread;
 use crate::pairing::{
     FrameAlone, FramePair, Ray, RowEdges, SideFrame, Surface, alone, frame_alone, has_no_point, in_order, load,
     round_ranges, thin,
@@ -52,8 +53,7 @@ impl<'a> Side<'a> {
 
     /// So many of the ids, evenly spread.
     fn spread(&self, most: usize) -> Vec<String> {
-        let n = self.ids.len();
-        (0..n.min(most)).map(|k| self.ids[k * n / n.min(most)].clone()).collect()
+        evenly_spread(&self.ids, most)
     }
 
     /// Keeps so many of the frames, evenly spread.

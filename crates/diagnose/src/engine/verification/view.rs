@@ -11,11 +11,12 @@ use crate::channels::mean::origins;
 use crate::channels::roughness::own_roughness_m;
 use crate::diagnosis::Finding;
 use crate::error::DiagnoseError;
+use crate::inference::{evenly_spread, median};
 use crate::pairing::{Corrections, FramePair, Lies, PairSide, Ray, SideFrame, pair_all};
 use nalgebra::Point3;
 use rayon::prelude::*;
 use sensor::EffectList;
-use statistics::{MEDIAN_OF_NORMAL, median_upper};
+use statistics::{MEDIAN_OF_NORMAL, mean};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -82,6 +83,8 @@ pub struct ViewState {
 }
 
 impl Discrepancy {
+    const ALL: [Discrepancy; 3] = [Discrepancy::Range, Discrepancy::Scatter, Discrepancy::Intensity];
+
     /// What shows the findings of a channel.
     fn of(channel: Channel) -> Discrepancy {
         match channel {
@@ -115,8 +118,10 @@ impl Verification<'_> {
         };
         let origins = origins(self.context.rig);
         let on = remade(&applied)?;
+        let with_all: BTreeMap<Discrepancy, ViewState> =
+            Discrepancy::ALL.map(|discrepancy| (discrepancy, ViewState::of(&on, &origins, discrepancy))).into();
         let switch = |finding, off: &FramePair, discrepancy| {
-            let [off, on] = thinned([off, &on].map(|pair| ViewState::of(pair, &origins, discrepancy)));
+            let [off, on] = thinned([ViewState::of(off, &origins, discrepancy), with_all[&discrepancy].clone()]);
             Switch { finding, discrepancy, off, on }
         };
         let of_one = |(number, finding): &(usize, &Finding)| {
@@ -131,7 +136,8 @@ impl Verification<'_> {
         let of_each: Vec<Result<Switch, DiagnoseError>> = acting.par_iter().map(of_one).collect();
         switches.extend(of_each.into_iter().collect::<Result<Vec<_>, _>>()?);
         switches.retain(|switch| switch.off != switch.on);
-        let points_m = some(on.measured.iter().map(|ray| place_m(ray, &origins)).collect(), MOST_POINTS);
+        let points_m: Vec<[f32; 3]> = on.measured.iter().map(|ray| place_m(ray, &origins)).collect();
+        let points_m = evenly_spread(&points_m, MOST_POINTS);
         let view = View { frame: recordings.id(frame).into(), points_m, switches };
         Ok(Some(view).filter(|view| !view.switches.is_empty()))
     }
@@ -153,12 +159,6 @@ impl Verification<'_> {
     }
 }
 
-/// At most `most` of some items, evenly spread.
-pub(super) fn some<T: Copy>(items: Vec<T>, most: usize) -> Vec<T> {
-    let n = items.len();
-    if n <= most { items } else { (0..most).map(|k| items[k * n / most]).collect() }
-}
-
 /// Where a return lies, in the frame of the clouds, m.
 fn place_m(ray: &Ray, origins: &[Point3<f64>]) -> [f32; 3] {
     ray.point(&origins[usize::from(ray.sensor)]).coords.cast::<f32>().into()
@@ -169,7 +169,7 @@ impl ViewState {
         let (values, lost_m) = match discrepancy {
             Discrepancy::Range => ranges(pair, origins),
             Discrepancy::Scatter => (of_patches(pair, |ray| own_roughness_m(ray).map(f64::abs), scatter_m), vec![]),
-            Discrepancy::Intensity => (of_patches(pair, ln_ratio, mean), vec![]),
+            Discrepancy::Intensity => (of_patches(pair, ln_ratio, |values| mean(&values)), vec![]),
         };
         ViewState { values, lost_m }
     }
@@ -181,7 +181,7 @@ fn thinned(states: [ViewState; 2]) -> [ViewState; 2] {
     let all = states.iter().map(|state| state.lost_m.len()).fold(MOST_LOST, usize::max);
     states.map(|ViewState { values, lost_m }| {
         let kept = lost_m.len() * MOST_LOST / all;
-        ViewState { values: some(values, MOST_POINTS), lost_m: some(lost_m, kept) }
+        ViewState { values: evenly_spread(&values, MOST_POINTS), lost_m: evenly_spread(&lost_m, kept) }
     })
 }
 
@@ -260,11 +260,7 @@ fn of_patches(
 
 /// Standard deviation of noise with these absolute values, m.
 fn scatter_m(values: Vec<f64>) -> f64 {
-    median_upper(values).unwrap_or(0.0) / MEDIAN_OF_NORMAL
-}
-
-fn mean(values: Vec<f64>) -> f64 {
-    values.iter().sum::<f64>() / values.len().max(1) as f64
+    median(values) / MEDIAN_OF_NORMAL
 }
 
 #[cfg(test)]
