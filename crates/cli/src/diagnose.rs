@@ -169,7 +169,8 @@ impl DiagnoseArgs {
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis, true)?;
-            let of_study = Link::to_file(&self.out, &self.out.join(STUDY).join("report.html"), "The study of the detectors");
+            let of_study =
+                Link::to_file(&self.out, &self.out.join(STUDY).join("report.html"), "The study of the detectors");
             self.write_page(&outcome, of_study.into_iter().collect())?;
         }
         Ok(end_of(&outcome.diagnosis))
