@@ -4,6 +4,7 @@
 mod causes;
 mod covariates;
 mod parameters;
+pub mod sizes;
 
 pub use causes::{Cause, Hypothesis, NoiseForm};
 pub use covariates::Covariate;

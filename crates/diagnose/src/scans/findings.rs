@@ -5,6 +5,7 @@ mod noise;
 mod rows;
 
 use super::{Seen, comb, gain_of, planes::Patch};
+use crate::catalogue::sizes::{LASERS_INTENSITY, LASERS_RANGE_M};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Finding, FindingGain, Minimum, Parameter, Status};
@@ -29,8 +30,8 @@ pub(super) fn all(seen: &Seen, notes: &mut Vec<String>) -> Findings {
     found.push(step.map(|s| comb_found(seen, &combs, s)));
     found.push(elevation::elevation_found(seen, notes));
     let minimum = BTreeMap::from([
-        (Cause::BeamRangeOffset, Minimum::new(Quantity::StdM, rows::LEAST_OFFSET_M)),
-        (Cause::BeamIntensity, Minimum::new(Quantity::Std, rows::LEAST_INTENSITY)),
+        (Cause::BeamRangeOffset, Minimum::new(Quantity::StdM, LASERS_RANGE_M)),
+        (Cause::BeamIntensity, Minimum::new(Quantity::Std, LASERS_INTENSITY)),
         (Cause::Quantisation, Minimum::new(Quantity::StepM, 0.001)),
     ]);
     (found.into_iter().flatten().collect(), minimum, considered)

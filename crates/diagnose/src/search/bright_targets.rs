@@ -1,6 +1,7 @@
 //! Bright targets: halos of false returns at their range (blooming), and shots beside them that return nothing.
 
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter, with_error};
+use crate::catalogue::sizes::BRIGHT_SHARE;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity, Unit};
 use crate::channels::brightness::Brightness;
 use crate::channels::halos::{
@@ -16,9 +17,6 @@ use crate::inference::roles::Role;
 use crate::pairing::FramePair;
 use rayon::prelude::*;
 use statistics::{blocks_of, deviation, draw_blocks};
-
-/// Smallest share of the shots beside a target that is reported: of fewer the next sign says nothing.
-const FLOOR: f64 = 0.05;
 
 /// Bins beyond which nothing is left of an effect: from 9 degrees.
 const FAR: usize = 36;
@@ -212,7 +210,7 @@ fn search_one(context: &Context, what: What, profiles: &[HaloFrame], result: &mu
         "no more around bright targets than around other edges"
     } else if [&chosen, &law].iter().any(|law| law.reach_rad > 0.99 * REACH_RAD[1]) {
         "as far from bright targets as is looked at: not around them"
-    } else if chosen.size < FLOOR || law.size < FLOOR.max(1.96 * errors[0]) {
+    } else if chosen.size < BRIGHT_SHARE || law.size < BRIGHT_SHARE.max(1.96 * errors[0]) {
         "too small to speak of"
     } else if law.reach_rad < 1.96 * errors[1] || confirmed <= demands.nats {
         "other frames do not confirm it"
@@ -220,7 +218,7 @@ fn search_one(context: &Context, what: What, profiles: &[HaloFrame], result: &mu
         "chosen"
     };
     result.consider(what.cause(), (nats, z), context.returns(&select), outcome);
-    result.minimum.push((what.cause(), Minimum::new(what.size(), FLOOR)));
+    result.minimum.push((what.cause(), Minimum::new(what.size(), BRIGHT_SHARE)));
     if outcome != "chosen" {
         return None;
     }

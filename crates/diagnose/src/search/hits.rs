@@ -13,6 +13,7 @@ use self::form::Corrections;
 use self::select::Selection;
 use super::unexplained::{Unexplained, mean_by_group};
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands, trimmed};
+use crate::catalogue::sizes::{LOST_OF_KIND, LOST_SHARE};
 use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::cells::{OBJECT, cell};
 use crate::channels::groups::{Group, Grouping, PartedFrame, total as group_total};
@@ -31,21 +32,12 @@ use rayon::prelude::*;
 use statistics::{blocks_of, draw_blocks};
 use std::collections::BTreeMap;
 
-/// Smallest share of lost returns that is reported.
-const FLOOR: f64 = 0.005;
-
-/// Smallest share lost on one kind of surface that is reported, of its own returns.
-const ZONE_FLOOR: f64 = 0.03;
-
 /// Share of its gain by which a richer law must exceed the simpler one to be reported beside it: the form of a law is
 /// never exactly that of the sensor.
 const RICHER_SHARE: f64 = 0.01;
 
 /// Bootstrap repetitions of the fits.
 const REFITS: usize = 40;
-
-/// Smallest spread of the share lost from group to group that is reported.
-const GROUP_FLOOR: f64 = 0.02;
 
 /// Fit of the shares lost by groups of directions: prior standard deviation of a fifth.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false, trust: 1.0 };
@@ -126,12 +118,12 @@ impl<'a> Search<'a> {
                 // material.
                 let on_round = if zone >= OBJECT { table.lost_on_round(before, zone) } else { 0.0 };
                 let beside = on_round.max(0.07 * joins);
-                own.min(most(Some(zone))) > ZONE_FLOOR + beside + 0.1 * self.displaced
+                own.min(most(Some(zone))) > LOST_OF_KIND + beside + 0.1 * self.displaced
             }
-            Law::Random => own.min(most(None)) > FLOOR + 0.02 * joins + 0.01 * self.displaced,
+            Law::Random => own.min(most(None)) > LOST_SHARE + 0.02 * joins + 0.01 * self.displaced,
             _ => {
                 let lost = (table.lost(laws) - table.lost(before)).abs();
-                lost.min(table.changed(laws, alone)) > FLOOR + 0.005 * joins + 0.01 * self.displaced
+                lost.min(table.changed(laws, alone)) > LOST_SHARE + 0.005 * joins + 0.01 * self.displaced
             }
         }
     }
@@ -145,7 +137,7 @@ impl<'a> Search<'a> {
         let cells = || self.select.iter().flat_map(|&i| &self.hits[i]).map(|(_, c)| c);
         let mismatches: f64 = cells().map(|c| c.simulated.n - c.matched + c.measured.n - c.matched).sum();
         let simulated: f64 = cells().map(|c| c.simulated.n).sum();
-        Minimum::new(Quantity::Share, (Z_STAR * mismatches.max(1.0).sqrt() / simulated.max(1.0)).max(FLOOR))
+        Minimum::new(Quantity::Share, (Z_STAR * mismatches.max(1.0).sqrt() / simulated.max(1.0)).max(LOST_SHARE))
     }
 
     /// Those of the chosen laws that lose enough on the estimating frames as well.

@@ -14,16 +14,6 @@ use crate::inference::roles::Role;
 use crate::pairing::FramePair;
 use rayon::prelude::*;
 
-/// Smallest factor between the intensities of the two sides that is reported, ln: a detector does not notice 3 %.
-const FLOOR: f64 = 0.03;
-
-/// Smallest effect of an exponent that is reported: root of the mean squared change of ln(intensity) over the rays.
-const FLOOR_RMS: f64 = 0.03;
-
-/// Smallest spread of the gains of rows that is reported beyond what rounding does, ln, where intensities have a spread
-/// of [`USUAL_SPREAD`] at least. It is less where they have less: a gain counts beside what surfaces do.
-const FLOOR_ROWS: f64 = 0.02;
-
 /// Spread of the intensities of surfaces, ln, of a sensor whose response is linear. One that is logarithmic has a
 /// quarter of it, and gains of the light are a quarter as large there.
 const USUAL_SPREAD: f64 = 0.8;

@@ -12,6 +12,7 @@ use self::hypotheses::{HYPOTHESES, Hypothesis, TARGETS_CLOCK};
 use self::rows::{ALL, Row, displacement_m, distance, errors_by_vehicle, keep_known, row, set_noise, sums};
 use super::geometry::Displacement;
 use super::{ChannelResult, Context, Repair, Selected, Z_STAR, causes_of, confidence, first_demands, record};
+use crate::catalogue::sizes::{CLOCK_S, LABELS_M, LABELS_MOVED_M, OBJECTS_M, OBJECTS_MOVED_M, SCAN_S};
 use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::labels::object_shifts;
 use crate::diagnosis::Minimum;
@@ -41,25 +42,19 @@ impl Side {
     /// Smallest constant shift that is reported, m.
     fn floor_m(self) -> f64 {
         match self {
-            Side::Labels => 0.03,
-            Side::Objects => 0.07,
+            Side::Labels => LABELS_M,
+            Side::Objects => OBJECTS_M,
         }
     }
 
     /// Smallest displacement of the objects that is reported, root mean square, m.
     fn least_displacement_m(self) -> f64 {
         match self {
-            Side::Labels => 0.02,
-            Side::Objects => 0.04,
+            Side::Labels => LABELS_MOVED_M,
+            Side::Objects => OBJECTS_MOVED_M,
         }
     }
 }
-
-/// Smallest time offset that is reported, s.
-const FLOOR_S: f64 = 0.001;
-
-/// Shortest duration of a scan that is reported, s.
-const FLOOR_SCAN_S: f64 = 0.005;
 
 /// Relative difference in gain below which causes of an object shift are reported as ambiguous even if it is
 /// significant: surface fitting has a systematic error of this size.
@@ -168,8 +163,8 @@ impl Search<'_> {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
         }
         let least = match cause {
-            Cause::TimeOffset if own != TARGETS_CLOCK => FLOOR_S,
-            Cause::RollingShutter => FLOOR_SCAN_S,
+            Cause::TimeOffset if own != TARGETS_CLOCK => CLOCK_S,
+            Cause::RollingShutter => SCAN_S,
             _ => self.side.floor_m(),
         };
         Trial {
@@ -256,7 +251,7 @@ impl Search<'_> {
         let offset = Minimum::new(Quantity::ForwardM, (Z_STAR * error(0)).max(self.side.floor_m()));
         let mut all = vec![(Cause::LabelOffset, offset)];
         if let Some(k) = [4, 3].into_iter().find(|&k| self.usable[k]) {
-            all.push((Cause::TimeOffset, Minimum::new(Quantity::OffsetS, (Z_STAR * error(k)).max(FLOOR_S))));
+            all.push((Cause::TimeOffset, Minimum::new(Quantity::OffsetS, (Z_STAR * error(k)).max(CLOCK_S))));
         }
         all
     }

@@ -3,6 +3,7 @@
 //! edge as beams are wide, and those with longer jumps have none.
 
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands};
+use crate::catalogue::sizes::BEAM_RAD;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::mean::noise_m;
 use crate::curve::{Curve, CurvePoint};
@@ -15,9 +16,6 @@ use crate::inference::roles::Role;
 use crate::pairing::{JUMPS, Jumps, LEVEL, OCTANTS, RowEdges, jump_m};
 use rayon::prelude::*;
 use statistics::{blocks_of, deviation, draw_blocks};
-
-/// Smallest width of a beam that is reported, rad: a tenth of a step of most sensors.
-const FLOOR_RAD: f64 = 3e-4;
 
 /// Largest width of a beam, rad.
 const WIDEST_RAD: f64 = 0.05;
@@ -219,7 +217,7 @@ pub fn search(context: &Context) -> ChannelResult {
     let confirmed: f64 = on_estimate.iter().map(|frame| chosen.gain_of(frame)).sum();
     let outcome = if !trial.gains_enough(&Demands { of_few: true, ..demands }) {
         "no more of them than on the simulated side"
-    } else if chosen.width_rad < FLOOR_RAD || law.width_rad < FLOOR_RAD.max(1.96 * error) {
+    } else if chosen.width_rad < BEAM_RAD || law.width_rad < BEAM_RAD.max(1.96 * error) {
         "too small to speak of"
     } else if !chosen.directions_agree(&on_select) {
         "edges in other directions do not say so"
@@ -229,7 +227,7 @@ pub fn search(context: &Context) -> ChannelResult {
         "chosen"
     };
     result.consider(Cause::MixedPixels, (nats, z), context.returns(&select), outcome);
-    result.minimum.push((Cause::MixedPixels, Minimum::new(Quantity::DivergenceRad, FLOOR_RAD.max(Z_STAR * error))));
+    result.minimum.push((Cause::MixedPixels, Minimum::new(Quantity::DivergenceRad, BEAM_RAD.max(Z_STAR * error))));
     if outcome == "chosen" {
         let gains: Vec<f64> = sides(context, &hold_out).iter().map(|frame| law.gain_of(frame)).collect();
         result.distance = gains.iter().map(|g| [g.max(0.0), *g, *g]).collect();
@@ -341,7 +339,7 @@ mod tests {
         let frames = frames(0.0, 2.5);
         let law = Law::of(&frames[..10].iter().collect::<Vec<_>>(), 0);
         let others: f64 = frames[10..].iter().map(|f| law.gain_of(f)).sum();
-        assert!(law.width_rad < FLOOR_RAD && others < 3.0, "{others} {law:?}");
+        assert!(law.width_rad < BEAM_RAD && others < 3.0, "{others} {law:?}");
     }
 
     #[test]

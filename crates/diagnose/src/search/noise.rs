@@ -15,6 +15,7 @@ use self::describe::found;
 use self::edges::consider_both;
 use self::select::Selection;
 use super::{ChannelResult, Context, Z_STAR, first_demands};
+use crate::catalogue::sizes::{JITTER_RAD, NOISE_M, NOISE_SHARE};
 use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::roughness::{RoughFrame, rough_frames, scales, total};
 use crate::diagnosis::Minimum;
@@ -22,15 +23,6 @@ use crate::inference::choice::Demands;
 use crate::inference::linear::{LinearFit, LinearFrame, fit};
 use crate::inference::noise::{NOISE_LAWS, NoiseLaw, NoiseTable};
 use crate::inference::roles::Role;
-
-/// Smallest standard deviation along the ray that is reported, m.
-const FLOOR_M: f64 = 0.003;
-
-/// Smallest jitter of directions that is reported, rad: 0.005 degrees, which are 4 mm at 50 m.
-const FLOOR_RAD: f64 = 8.7e-5;
-
-/// Smallest relative increase of the variance, averaged over returns, that is reported.
-const FLOOR_SHARE: f64 = 0.1;
 
 /// Place of [`NoiseLaw::Constant`] in the list of laws.
 const CONSTANT: usize = 0;
@@ -166,12 +158,12 @@ impl<'a> Search<'a> {
         let typical = self.table.rows().iter().map(|r| r.2 / r.3[1]).sum::<f64>();
         let added_m2 = along / typical.max(1e-12);
         let enough = match law {
-            NoiseLaw::Angular => theta.abs().sqrt() > FLOOR_RAD,
-            _ => added_m2.sqrt() > FLOOR_M,
+            NoiseLaw::Angular => theta.abs().sqrt() > JITTER_RAD,
+            _ => added_m2.sqrt() > NOISE_M,
         };
         // Surfaces that heavy tails draw are uneven alike at all angles of incidence.
         let drawn = !matches!(law, NoiseLaw::Angular) && added_m2 < self.drawn_m2;
-        enough && !drawn && share / n.max(1.0) > FLOOR_SHARE
+        enough && !drawn && share / n.max(1.0) > NOISE_SHARE
     }
 
     /// Fits what was chosen on the estimating frames and measures it on the held-out ones. Returns the fitted laws.

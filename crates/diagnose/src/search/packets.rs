@@ -5,6 +5,7 @@ mod runs;
 
 use self::runs::Runs;
 use super::{ChannelResult, Context, Found, sensor_number, with_error};
+use crate::catalogue::sizes::PACKETS_SHARE;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
@@ -33,9 +34,6 @@ const DARK: f64 = 0.1;
 /// Share of the returns that is expected in a bin, by their ranges and by the same bin in other scans, from which on
 /// the bin is not dark for another reason.
 const USUALLY_SEEN: f64 = 0.5;
-
-/// Smallest share of returns that is reported: one in a thousand.
-const FLOOR: f64 = 1e-3;
 
 /// Fewest dark bins, and fewest runs of them of one sensor. That all returns of many shots in a row are lost by chance
 /// is as good as impossible; a single run may be a frame that was cut off.
@@ -196,7 +194,7 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     let chosen = loses(dark)
         && (number(&other.0) as f64) < OTHER_SIDE * number(&dark.0) as f64
         && (packets.dim(&all) as f64) < DIM_BINS * number(&dark.0) as f64
-        && mean > FLOOR;
+        && mean > PACKETS_SHARE;
     result.considered.push(Considered {
         cause: Cause::PacketLoss.into(),
         channel: Channel::Packets,
@@ -204,7 +202,7 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
         z,
         outcome: if chosen { "chosen" } else { "no shots in a row are lost in single scans" }.into(),
     });
-    result.minimum.push((Cause::PacketLoss, Minimum::new(Quantity::Share, FLOOR)));
+    result.minimum.push((Cause::PacketLoss, Minimum::new(Quantity::Share, PACKETS_SHARE)));
     if !chosen {
         // What the simulation loses is nothing that the measured side has in addition.
         return (result, if loses(other) { packets.arrived(context.frames) } else { None });

@@ -1,6 +1,7 @@
 //! Patches of directions that lose more than others: dirt or a scratch on a sensor's window.
 
 use super::{Context, Found, NamedParameter, Z_STAR, parameter, sensor_number};
+use crate::catalogue::sizes::{PATCH_LOST, PATCH_SHARE};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask};
@@ -19,9 +20,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Largest number of patches that are reported.
 const MOST: usize = 3;
-
-/// Smallest loss of a patch that is reported: as a share of all simulated returns, and of those of the patch.
-const FLOOR: [f64; 2] = [3e-4, 0.08];
 
 /// Largest scatter of the share that a window takes over blocks of frames, whose surfaces return less or more light.
 const SCATTER: f64 = 0.25;
@@ -56,7 +54,7 @@ pub(super) fn search(context: &Context, mask: &mut Mask) -> Vec<Found> {
         let of_block = |members: &Vec<usize>| patch::total(members.iter().map(|&i| &of_frames[i]));
         let of_blocks: Vec<Losses> = blocks_of(&blocks).iter().map(of_block).collect();
         let together = patch::total(of_blocks.iter());
-        let enough = together.lost() >= FLOOR[0] * returns && together.share() >= FLOOR[1];
+        let enough = together.lost() >= PATCH_SHARE * returns && together.share() >= PATCH_LOST;
         let (_, z) = total_and_z(&of_frames.iter().map(Losses::lost).collect::<Vec<_>>());
         if !enough || z < Z_STAR || !is_constant(&of_blocks) {
             continue;

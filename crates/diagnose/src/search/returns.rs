@@ -9,6 +9,7 @@ mod weather;
 use self::describe::found;
 use self::weather::Air;
 use super::{ChannelResult, Context, NamedParameter, Z_STAR, with_error};
+use crate::catalogue::sizes::{ALONE_SHARE, BEHIND_SHARE, GROUPED_SHARE};
 use crate::catalogue::{Cause, Channel, Kind, Quantity, Unit};
 use crate::channels::mean::origins;
 use crate::channels::plumes::{Extent, MOST, PlumeFrame, plume_frame};
@@ -24,7 +25,7 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 
 /// Smallest share of returns that is reported, by kind.
-const FLOORS: [f64; 3] = [0.0008, 0.0015, 0.003];
+const FLOORS: [f64; 3] = [ALONE_SHARE, GROUPED_SHARE, BEHIND_SHARE];
 
 /// Ratio of the excess in front of surfaces to the excess behind them, or the reverse, from which on objects were
 /// added or are missing. Below it, surfaces stand elsewhere.

@@ -1,6 +1,7 @@
 //! A common elevation error of all lasers, from the ground and from walls.
 
 use super::{others, parameter, spread};
+use crate::catalogue::sizes::LASERS_ELEVATION_DEG;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Finding, FindingGain, Status};
@@ -20,9 +21,6 @@ fn mean_and_interval(values: &[f64]) -> Option<(f64, [f64; 2])> {
     let error = spread(values.iter().copied()) / (n.max(2) as f64 - 1.0).sqrt();
     (n >= 3).then(|| (mean, [mean - t975(n - 1) * error, mean + t975(n - 1) * error]))
 }
-
-/// Smallest mean elevation error that is reported although its interval contains zero, degrees.
-const LEAST_DEG: f64 = 0.03;
 
 /// Distance at which the plot of the ground is zero, m: the middle of the column of [`tilt::by_ground`].
 const MIDDLE_M: f64 = 12.0;
@@ -58,7 +56,7 @@ pub(super) fn elevation_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Fi
     let walls = mean_and_interval(&by_walls);
     let outside = |ci: [f64; 2]| ci[0] > 0.0 || ci[1] < 0.0;
     let confirmed = walls.is_some_and(|(_, w)| outside(w) && w[0] < ci[1] && w[1] > ci[0]);
-    if !outside(ci) && mean.to_degrees().abs() < LEAST_DEG {
+    if !outside(ci) && mean.to_degrees().abs() < LASERS_ELEVATION_DEG {
         return None;
     }
     let named = confirmed && outside(ci);

@@ -1,18 +1,13 @@
 //! Offsets of range and of intensity of single lasers.
 
 use super::{Named, around, others, parameter, patches, spread};
+use crate::catalogue::sizes::{LASERS_INTENSITY, LASERS_RANGE_M};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Finding, FindingGain, Parameter};
 use crate::scans::{Seen, brightness, draws, gain_of, interval, offsets};
 use crate::search::NamedParameter;
 use rayon::prelude::*;
-
-/// Smallest spread of the lasers' range offsets that is reported, m.
-pub(super) const LEAST_OFFSET_M: f64 = 0.002;
-
-/// Smallest spread of the lasers' intensities that is reported, of 1.
-pub(super) const LEAST_INTENSITY: f64 = 0.004;
 
 /// Offsets with larger standard errors are left out of the spread, m.
 const CERTAIN_M: f64 = 0.006;
@@ -100,7 +95,7 @@ pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Find
     let fitted = Fitted::new(n, fit);
     let (std, std_ci) = spread_beyond_noise(&fitted);
     let gain = offsets_gain(&walls, fit);
-    if std < LEAST_OFFSET_M || gain.ci95[0] <= 0.0 {
+    if std < LASERS_RANGE_M || gain.ci95[0] <= 0.0 {
         notes.push(format!(
             "range offsets of single lasers: {:.1} mm from one to the next, {:.4} nats a return on flat walls of other scans: nothing to speak of",
             1000.0 * std,
@@ -176,7 +171,7 @@ pub(super) fn intensity_found(seen: &Seen) -> Option<Finding> {
     });
     let gain = intensity_gain(&sums, contrasts);
     let std = spread(fitted.offsets.iter().flatten().copied());
-    if std < LEAST_INTENSITY || gain.ci95[0] <= 0.0 {
+    if std < LASERS_INTENSITY || gain.ci95[0] <= 0.0 {
         return None;
     }
     let std_ci = interval(fitted.drawn.iter().map(|d| spread(d.iter().flatten().copied())).collect());

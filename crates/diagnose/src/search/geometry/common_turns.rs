@@ -1,10 +1,10 @@
 //! Pitch and roll of the ego vehicle beside one sensor that is mounted otherwise than the rig says: turns that all
 //! other sensors see alike.
 
-use super::floor::FLOOR_TURN_RAD;
 use super::hypotheses::Hypothesis;
 use super::sums::Sums;
 use crate::catalogue::Cause;
+use crate::catalogue::sizes::TURN_RAD;
 use crate::channels::mean::{Column, OwnPoses};
 use crate::search::Z_STAR;
 
@@ -53,7 +53,7 @@ fn alike(poses: &[OwnPoses], select: &[usize], blocks: &[usize], except: usize) 
     };
     let agrees = |turn: &usize| {
         let seen: Vec<(f64, f64)> = others.iter().map(|&s| mean_and_error(s, *turn)).collect();
-        let sure = seen.iter().all(|(m, e)| m.abs() > Z_STAR * e && m.abs() > FLOOR_TURN_RAD && m * seen[0].0 > 0.0);
+        let sure = seen.iter().all(|(m, e)| m.abs() > Z_STAR * e && m.abs() > TURN_RAD && m * seen[0].0 > 0.0);
         let sizes = || seen.iter().map(|(m, _)| m.abs());
         sure && sizes().fold(f64::INFINITY, f64::min) > ALIKE * sizes().fold(0.0, f64::max)
     };

@@ -1,11 +1,12 @@
 //! Findings of geometry: parameters, sentences and plots.
 
 use super::curve::linear_curve;
-use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SWEEP, FLOOR_TURN_RAD};
+use super::floor::{FLOOR_GROUPS, FLOOR_SWEEP};
 use super::hypotheses::Hypothesis;
 use super::steadiness::come_with_time;
 use super::sums::{Sums, group_fit, row_columns, split};
 use super::{Search, Selected};
+use crate::catalogue::sizes::{DISPLACED_M, RANGE_OFFSET_M, TURN_RAD};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
 use crate::channels::groups::{Group, Grouping, total};
 use crate::channels::mean::Column;
@@ -363,7 +364,7 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(C
     let displacing = |c: Column| {
         let sensor = if let Column::SensorPose(sensor, _) = c { Some(sensor) } else { None };
         let k = sums.columns.iter().position(|x| *x == c);
-        k.map_or(0.0, |k| FLOOR_DISPLACED_M / sums.displaced_m(select, sensor, &[(k, 1.0)], &sums.base).max(1e-3))
+        k.map_or(0.0, |k| DISPLACED_M / sums.displaced_m(select, sensor, &[(k, 1.0)], &sums.base).max(1e-3))
     };
     let mut all = Vec::new();
     let mut push = |cause: Cause, quantity: Quantity, value: Option<f64>, floor: f64, factor: f64| {
@@ -373,16 +374,16 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(C
     };
     let deg = 1f64.to_degrees();
     let [offset, pitch] = [Column::RangeOffset, Column::Pose(1)];
-    push(Cause::RangeBias, Quantity::OffsetM, error(offset), displacing(offset).max(FLOOR_OFFSET_M), 1.0);
+    push(Cause::RangeBias, Quantity::OffsetM, error(offset), displacing(offset).max(RANGE_OFFSET_M), 1.0);
     let drift = Column::Drift(1);
-    push(Cause::RangeDrift, Quantity::DriftM, error(drift), displacing(drift).max(FLOOR_OFFSET_M), 1.0);
-    let least_lean = FLOOR_TURN_RAD / sums.moments.most_lean().max(1e-9);
+    push(Cause::RangeDrift, Quantity::DriftM, error(drift), displacing(drift).max(RANGE_OFFSET_M), 1.0);
+    let least_lean = TURN_RAD / sums.moments.most_lean().max(1e-9);
     let lean = displacing(Column::Lean).max(least_lean);
     push(Cause::EgoAttitude, Quantity::PitchAt70MpsDeg, error(Column::Lean), lean, deg * lean_at(70.0));
-    push(Cause::PitchRoll, Quantity::PitchDeg, error(pitch), displacing(pitch).max(FLOOR_TURN_RAD), deg);
+    push(Cause::PitchRoll, Quantity::PitchDeg, error(pitch), displacing(pitch).max(TURN_RAD), deg);
     let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
     // The pose of one of several sensors has no other smallest size.
-    let least = if one == Column::Pose(2) { FLOOR_TURN_RAD } else { 0.0 };
+    let least = if one == Column::Pose(2) { TURN_RAD } else { 0.0 };
     push(Cause::SensorExtrinsics, Quantity::YawDeg, error(one), displacing(one).max(least), deg);
     let ahead = Column::Sweep(0);
     push(Cause::RollingShutter, Quantity::ShearXM, error(ahead), displacing(ahead).max(FLOOR_SWEEP[0]), 1.0);

@@ -3,35 +3,22 @@
 use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit};
 use crate::catalogue::Cause;
+use crate::catalogue::sizes::{
+    DISPLACED_M, FAR_RANGE_OFFSET_M, RANGE_OFFSET_M, ROWS_ELEVATION_RAD, ROWS_RANGE_M, SHIFT_M, STEPS_RANGE_M,
+    STRIPS_RANGE_M, SWEEP_M, SWEEP_RAD, TURN_RAD,
+};
 use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
-#[cfg(doc)]
-use crate::channels::mean::STRUCTURE_M;
 use crate::channels::moments::COURSES;
 use crate::inference::grouped;
 use nalgebra::{DMatrix, DVector};
 
-/// Smallest range bias that is reported, at 10 m, m.
-pub(super) const FLOOR_OFFSET_M: f64 = 0.012;
-
-/// Smallest turn of the scene that is reported, rad: 0.03 degrees.
-pub(super) const FLOOR_TURN_RAD: f64 = 5.2e-4;
-
-/// Smallest shift of the scene that is reported, m.
-const FLOOR_SHIFT_M: f64 = 0.04;
-
-/// Smallest displacement over a scan that is reported: along x and y in m, the shift of a scene at either end; about z
-/// in rad.
-pub(super) const FLOOR_SWEEP: [f64; 3] = [2.0 * FLOOR_SHIFT_M, 2.0 * FLOOR_SHIFT_M, 0.01];
-
-/// Smallest displacement of surfaces that is reported, root mean square over the returns, m, without the part that
-/// errors of the surfaces themselves and the other hypotheses can be. The surfaces of a model lie up to [`STRUCTURE_M`]
-/// beside the real ones in all frames alike: more frames do not tell a smaller displacement from that.
-pub(super) const FLOOR_DISPLACED_M: f64 = 0.004;
+/// Smallest displacement over a scan that is reported: along x and y, m; about z, rad.
+pub(super) const FLOOR_SWEEP: [f64; 3] = [SWEEP_M, SWEEP_M, SWEEP_RAD];
 
 /// Smallest spread of group offsets that is reported: rows in range, m; rows in elevation, rad; strips of azimuth in
 /// range, m; steps of range, m.
-pub(super) const FLOOR_GROUPS: [f64; 4] = [0.006, 2.6e-4, 0.02, 0.012];
+pub(super) const FLOOR_GROUPS: [f64; 4] = [ROWS_RANGE_M, ROWS_ELEVATION_RAD, STRIPS_RANGE_M, STEPS_RANGE_M];
 
 /// Steps of range to either side that an offset by range is compared with, 2 m: a bias and a scale are alike there.
 const STEPS_BESIDE: u16 = 8;
@@ -62,7 +49,7 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
             let sensor_of = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
             let sensor = columns.iter().find_map(sensor_of);
             let others: Vec<usize> = fitted.columns.iter().filter(|c| !columns.contains(c)).copied().collect();
-            if sums.displaced_m(select, sensor, &coefficients, &others) < FLOOR_DISPLACED_M {
+            if sums.displaced_m(select, sensor, &coefficients, &others) < DISPLACED_M {
                 return false;
             }
             if sensor.is_some() {
@@ -72,8 +59,8 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
                 |column: Column| coefficients.iter().find(|(c, _)| sums.columns[*c] == column).map_or(0.0, |(_, t)| *t);
             let drift_m: f64 = (0..COURSES).map(|k| of(Column::Drift(k))).sum();
             let bias_m = |range_m: f64| (of(Column::RangeOffset) + range_m * of(Column::RangeScale) + drift_m).abs();
-            bias_m(10.0) > FLOOR_OFFSET_M
-                || bias_m(40.0) > 3.2 * FLOOR_OFFSET_M
+            bias_m(10.0) > RANGE_OFFSET_M
+                || bias_m(40.0) > FAR_RANGE_OFFSET_M
                 || coefficients.iter().any(|(c, t)| t.abs() > sums.smallest(*c))
         }
     }
@@ -102,11 +89,11 @@ impl Sums {
     /// Smallest coefficient of a column that is reported for itself.
     fn smallest(&self, column: usize) -> f64 {
         match self.columns[column] {
-            Column::Pose(0..3) => FLOOR_TURN_RAD,
-            Column::Pose(_) => FLOOR_SHIFT_M,
+            Column::Pose(0..3) => TURN_RAD,
+            Column::Pose(_) => SHIFT_M,
             Column::Sweep(k) => FLOOR_SWEEP[k],
             Column::Scan => FLOOR_SWEEP[0] / self.moments.middle_m_s().max(1e-9),
-            Column::Lean => FLOOR_TURN_RAD / self.moments.most_lean().max(1e-9),
+            Column::Lean => TURN_RAD / self.moments.most_lean().max(1e-9),
             Column::RangeOffset
             | Column::RangeScale
             | Column::Drift(_)

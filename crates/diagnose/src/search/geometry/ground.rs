@@ -2,7 +2,7 @@
 //! the same in the vehicle's axes, or changes from frame to frame; the ground is the same where it is, and the vehicle
 //! passes over it.
 
-use super::floor::FLOOR_DISPLACED_M;
+use crate::catalogue::sizes::DISPLACED_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::heights::{Cell, common_std, heights, largest_of_ground};
 use crate::curve::{Curve, means};
@@ -33,9 +33,9 @@ pub fn search(context: &Context) -> ChannelResult {
     let (total, z) = total_and_z(&gains);
     let [on_select, on_estimate] = [&select, &estimate].map(|which| std_m(&pairs, which, &context.blocks(which)));
     // Surfaces of a model lie beside the real ones by as much as the floor.
-    let outcome = outcome((total, z), [on_select, on_estimate], FLOOR_DISPLACED_M);
+    let outcome = outcome((total, z), [on_select, on_estimate], DISPLACED_M);
     result.consider(Cause::GroundError, (total, z), context.returns(&select), outcome);
-    result.minimum.push((Cause::GroundError, Minimum::new(Quantity::StdM, FLOOR_DISPLACED_M)));
+    result.minimum.push((Cause::GroundError, Minimum::new(Quantity::StdM, DISPLACED_M)));
     if outcome == "chosen" {
         let [fitted, without] =
             [&BOTH[..], &BOTH[1..]].map(|columns| fit(&on(&estimate), &context.blocks(&estimate), columns, &PRIOR));

@@ -2,8 +2,8 @@
 //! one direction lies higher or lower than simulated, and far ground of the same direction by so much more. The world
 //! does not do that: what is uneven near the vehicle says nothing about what is farther away.
 
-use super::floor::FLOOR_TURN_RAD;
 use super::ground::outcome;
+use crate::catalogue::sizes::TURN_RAD;
 use crate::catalogue::{Cause, Channel, Covariate};
 use crate::channels::heights::{Cell, Heights, common_std, heights, largest_of_ground};
 use crate::channels::mean::origins;
@@ -56,7 +56,7 @@ pub fn search(context: &Context) -> ChannelResult {
     let on = |which: &[usize]| which.iter().map(|&f| &sums[f]).collect::<Vec<_>>();
     let (total, z) = total_and_z(&cross_gains(&on(&select), &context.blocks(&select), &[0], &PRIOR));
     let [on_select, on_estimate] = [&select, &estimate].map(|which| tilt_rad(&pairs, which, &context.blocks(which)));
-    let outcome = outcome((total, z), [on_select, on_estimate], FLOOR_TURN_RAD);
+    let outcome = outcome((total, z), [on_select, on_estimate], TURN_RAD);
     result.consider(Cause::Unexplained, (total, z), context.returns(&select), outcome);
     if outcome == "chosen" {
         let fitted = fit(&on(&estimate), &context.blocks(&estimate), &[0], &PRIOR);

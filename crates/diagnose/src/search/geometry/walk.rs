@@ -1,6 +1,7 @@
 //! Range walk: ranges that depend on how bright a surface is. It is looked for before all else of geometry, between
 //! bright and dark spots of one surface, which no pose and no error of the surfaces displaces against each other.
 
+use crate::catalogue::sizes::WALK_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::brightness::{BrightFrame, Brightnesses, bright_frames};
 use crate::channels::mean::{origins, own_poses, usable, usual_noise_m};
@@ -14,9 +15,6 @@ use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands, parame
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use sensor::Effect;
-
-/// Smallest walk that is reported, m for each factor e of brightness: less is below the step of most sensors.
-const FLOOR_M: f64 = 0.003;
 
 /// Width of a point of the plot, ln.
 const BIN_LN: f64 = 0.25;
@@ -122,7 +120,7 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     let chosen = sums.fit(context, &select);
     let demands = first_demands();
     let (total, z) = total_and_z(&gains);
-    let large = chosen.theta[0].abs() > FLOOR_M;
+    let large = chosen.theta[0].abs() > WALK_M;
     let enough = total > demands.nats && z > demands.z;
     let [by_octant, expected] = sums.by_octant(&chosen, &select);
     let alike = directions_agree(&by_octant, &expected);
@@ -134,10 +132,10 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     };
     let cause = Cause::ReflectivityWalk;
     result.consider(cause, (total, z), context.returns(&select), outcome);
-    let least = Minimum::new(Quantity::WalkM, (Z_STAR * sums.error_m(&chosen, &select)).max(FLOOR_M));
+    let least = Minimum::new(Quantity::WalkM, (Z_STAR * sums.error_m(&chosen, &select)).max(WALK_M));
     result.minimum.push((cause, least));
     let fitted = sums.fit(context, &estimate);
-    if outcome != "chosen" || fitted.theta[0].abs() < FLOOR_M {
+    if outcome != "chosen" || fitted.theta[0].abs() < WALK_M {
         return (result, None);
     }
     let walk = Walk { brightness: sums.brightness, by_m: fitted.theta[0] };

@@ -1,6 +1,7 @@
 //! Which laws lose returns: a sum of laws, each chosen beside any form of the others.
 
-use super::{GROUP_FLOOR, GROUPED, Search, refit};
+use super::{GROUPED, Search, refit};
+use crate::catalogue::sizes::LOST_SPREAD;
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
 use crate::diagnosis::Considered;
@@ -210,7 +211,7 @@ impl Search<'_> {
         let laws = refit(&self.table, chosen);
         let how = GroupFit { centred: !chosen.is_empty(), ..GROUPED };
         let groups = |grouping| self.loss_groups(grouping, &self.table, &laws);
-        direction_trials(&self.select, &self.blocks, LAWS.len(), how, [GROUP_FLOOR; 2], groups)
+        direction_trials(&self.select, &self.blocks, LAWS.len(), how, [LOST_SPREAD; 2], groups)
     }
 }
 

@@ -1,6 +1,7 @@
 //! The law of intensities: its form, its fit and its finding.
 
-use super::{FLOOR, FLOOR_RMS, PRIOR, Search};
+use super::{PRIOR, Search};
+use crate::catalogue::sizes::{EXPONENT_LN, GAIN_LN};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::intensity::{BRIGHTNESS, COS, GAIN, OF_THE_WORLD, RANGE, REFERENCE_M, Sample, ln_ratio};
 use crate::curve::{Curve, CurvePoint};
@@ -77,7 +78,7 @@ impl Search<'_> {
                     let at = columns.iter().position(|own| own == c).expect("a column of the form");
                     fitted.theta[at].abs() * self.spread(&self.select, *c)
                 };
-                let above_floor = form.exponents.iter().all(|c| rms(c) > FLOOR_RMS);
+                let above_floor = form.exponents.iter().all(|c| rms(c) > EXPONENT_LN);
                 let gains = cross_gains(&frames, &blocks, &columns, &PRIOR);
                 let cause = Cause::IntensityLaw;
                 (form, Trial { candidate: 0, cause, parameters: columns.len(), gains, expected: vec![], above_floor })
@@ -97,7 +98,7 @@ impl Search<'_> {
             .expect("the best is near itself");
         let law = self.law(&self.select, form);
         // A factor that is different for every kind of surface is one of the world.
-        let least = FLOOR.max(self.spread_of_kinds(&law)).max(Z_STAR * self.of_rows);
+        let least = GAIN_LN.max(self.spread_of_kinds(&law)).max(Z_STAR * self.of_rows);
         let alone = form.exponents.is_empty();
         let above_floor = !alone || law.gain[0].abs() > least;
         let gains = if alone { self.gains_of_factor() } else { trial.gains.clone() };
@@ -107,7 +108,7 @@ impl Search<'_> {
         let trial = Trial { above_floor, gains, ..trial.clone() };
         let choice = chosen.then(Choice::of_one);
         result.considered.extend(record(&[trial], choice.as_ref(), Channel::Intensity, rays, &demands));
-        result.minimum.push((Cause::IntensityLaw, Minimum::new(Quantity::Gain, (Z_STAR * law.gain[1]).max(FLOOR))));
+        result.minimum.push((Cause::IntensityLaw, Minimum::new(Quantity::Gain, (Z_STAR * law.gain[1]).max(GAIN_LN))));
         chosen.then(|| form.clone())
     }
 
@@ -173,13 +174,13 @@ impl Search<'_> {
         // The true law may have another form: half of the smallest effect that is reported.
         let with_form = |c: usize| {
             let [value, error] = law.coefficient(c);
-            let of_form = if value == 0.0 { 0.0 } else { 0.5 * FLOOR_RMS / self.spread(&self.estimate, c).max(0.1) };
+            let of_form = if value == 0.0 { 0.0 } else { 0.5 * EXPONENT_LN / self.spread(&self.estimate, c).max(0.1) };
             [value, error.hypot(of_form)]
         };
         let [range, cos, brightness] = [RANGE, COS, BRIGHTNESS].map(with_form);
         // ln I' = gain + gamma ln I + ..., with the logarithm counted from its mean in the fit.
         let ln_gain = law.gain[0] - brightness[0] * self.scale.centre;
-        let ln_error = law.gain[1].hypot(0.5 * FLOOR).hypot(self.scale.centre * brightness[1]);
+        let ln_error = law.gain[1].hypot(0.5 * GAIN_LN).hypot(self.scale.centre * brightness[1]);
         let gain = ln_gain.exp();
         let with_bounds =
             |estimate: f64, low: f64, high: f64| Parameter { estimate, unit: Quantity::Gain.unit(), ci95: [low, high] };

@@ -1,7 +1,8 @@
 //! Gains of single rows beyond the law of intensities.
 
 use super::law::Law;
-use super::{FLOOR_ROWS, ROWS, Search, USUAL_SPREAD};
+use super::{ROWS, Search, USUAL_SPREAD};
+use crate::catalogue::sizes::ROWS_GAIN_LN;
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity};
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::intensity::Sample;
@@ -39,7 +40,7 @@ impl Search<'_> {
         let gains = grouped::cross_part_gains(rows, &self.select, &blocks, ROWS, true);
         let all = group_total(self.select.iter().flat_map(|&i| &rows[i]));
         let std = grouped::rough_spread(&all, &grouped::offsets(&all, ROWS), ROWS);
-        let least = FLOOR_ROWS * (self.scale.spread / USUAL_SPREAD).min(1.0) + self.scale.rounding;
+        let least = ROWS_GAIN_LN * (self.scale.spread / USUAL_SPREAD).min(1.0) + self.scale.rounding;
         let above_floor = std > least;
         let trial =
             Trial { candidate: 0, cause: Cause::BeamIntensity, parameters: 2, gains, expected: vec![], above_floor };

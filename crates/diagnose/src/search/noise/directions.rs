@@ -1,6 +1,7 @@
 //! Noise that depends on row or azimuth.
 
 use super::{Search, Term};
+use crate::catalogue::sizes::{DIRECTIONS_NOISE, ROWS_NOISE};
 use crate::catalogue::{Channel, Quantity};
 use crate::channels::cells::cell;
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
@@ -18,7 +19,7 @@ pub(super) const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centr
 
 /// Smallest spread of the added variance that is reported, by grouping. Rows have ranges and angles of their own,
 /// where laws may have another form; azimuths do not.
-const GROUP_FLOORS: [f64; 2] = [0.6, 0.25];
+const GROUP_FLOORS: [f64; 2] = [ROWS_NOISE, DIRECTIONS_NOISE];
 
 impl Search<'_> {
     /// Trials of tables by row and by azimuth on top of some laws.

@@ -1,7 +1,8 @@
 //! Ghosts: returns by way of a mirror. They lie behind the surface that reflected their shot.
 
 use super::weather::Air;
-use super::{FLOORS, cross_gains, excess, gain, share_of};
+use super::{cross_gains, excess, gain, share_of};
+use crate::catalogue::sizes::ALONE_SHARE;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::mirrors::{Images, behind_frame, images, is_behind};
 use crate::channels::returns::{Odd, OddFrame};
@@ -15,9 +16,6 @@ use rayon::prelude::*;
 /// explain them. Most images are not in the cloud: the sensor does not see what faces the mirror alone, and normals of
 /// curved surfaces are not known well enough.
 const MIRRORED: f64 = 0.15;
-
-/// Smallest share of all returns that is reported: that of lone returns.
-const FLOOR: f64 = FLOORS[BEHIND];
 
 /// Their place among the counts of a frame: they are lone returns.
 const BEHIND: usize = Odd::Alone as usize;
@@ -46,7 +44,7 @@ pub(super) fn search(
     let (total, z) = total_and_z(&gains);
     let outcome = if total <= first_demands().nats || !significant(&gains, Z_STAR) {
         "no more returns behind surfaces than on the simulated side"
-    } else if [select, estimate].into_iter().any(|role| excess_of(role)[1] <= FLOOR) {
+    } else if [select, estimate].into_iter().any(|role| excess_of(role)[1] <= ALONE_SHARE) {
         "too small to speak of"
     } else if !air.mostly_behind() {
         "as many before surfaces: false alarms"
@@ -54,7 +52,7 @@ pub(super) fn search(
         "chosen"
     };
     result.consider(Cause::Ghosts, (total, z), context.returns(select), outcome);
-    result.minimum.push((Cause::Ghosts, Minimum::new(Quantity::Share, FLOOR)));
+    result.minimum.push((Cause::Ghosts, Minimum::new(Quantity::Share, ALONE_SHARE)));
     if outcome != "chosen" {
         return false;
     }

@@ -1,6 +1,7 @@
 //! Spray or dust behind vehicles: returns in the air behind them, and not in that before them.
 
 use super::{Z_BY_SIGNS, poisson_distance};
+use crate::catalogue::sizes::SPRAY_SHARE;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::plumes::{Droplet, Extent, Plume, PlumeFrame};
 use crate::curve::{Curve, CurvePoint};
@@ -12,9 +13,6 @@ use crate::inference::counts::gain_of_count;
 use crate::inference::linear::cross_validated;
 use crate::search::{ChannelResult, Found, Z_STAR, first_demands, parameter};
 use sensor::Effect;
-
-/// Smallest share of all returns that is reported: some droplets behind the nearest vehicle.
-const FLOOR: f64 = 2e-4;
 
 /// Ratio of the density behind vehicles to that before them from which on it is theirs: what is missing in the
 /// simulation stands before vehicles as often as behind them.
@@ -82,7 +80,7 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
         select.iter().map(|f| f.measured[0].len() as f64 - f.measured[1].len() as f64).collect();
     let density = Density::of(select.iter().copied());
     let seen = significant(&gains, Z_STAR) || significant_by_signs(&differences, Z_BY_SIGNS[0]);
-    let floor_per_m = FLOOR * frames.returns / select.iter().map(|f| f.path_m(0)).sum::<f64>().max(1.0);
+    let floor_per_m = SPRAY_SHARE * frames.returns / select.iter().map(|f| f.path_m(0)).sum::<f64>().max(1.0);
     let few = |density: &Density| density.behind < floor_per_m.max(TIMES * density.base);
     let (estimate, hold_out) = (of(frames.estimate), of(frames.hold_out));
     let on_estimate = Density::of(estimate.iter().copied());
