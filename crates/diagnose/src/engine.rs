@@ -244,8 +244,9 @@ struct Engine<'a> {
 }
 
 impl Engine<'_> {
-    /// Pairs all frames anew.
-    fn pair(&self, corrections: Corrections) -> Result<Vec<FramePair>, DiagnoseError> {
+    /// Pairs all frames anew, in place of others, of which the memory is freed before.
+    fn pair(&self, corrections: Corrections, others: Option<Vec<FramePair>>) -> Result<Vec<FramePair>, DiagnoseError> {
+        drop(others);
         pair_all(self.recordings, self.sensors, corrections, kept_of_frame(self.recordings.len()), &|_| ())
     }
 
@@ -267,14 +268,15 @@ impl Engine<'_> {
         let (mut sliding, slide) = self.rolling_shutter(&context)?;
         let (rounding, step_m) = search::quantisation::search(&context, Rounded::Ranges);
         let (of_coordinates, _) = search::quantisation::search(&context, Rounded::Coordinates);
-        let dual = search::dual_returns::search(&context);
+        let mixed = |frame: usize| self.recordings.mixed_per_rad(frame, self.sensors);
+        let dual = search::dual_returns::search(&context, mixed)?;
         let mut known = Known { slide, step_m, walk: None, displaced: Displacement::default() };
-        let mut standing = known.standing(self)?;
+        let mut standing = known.standing(self, None)?;
         let recorded_still = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context.clone() };
         let (by_brightness, walk) = search::geometry::walk::search(&recorded_still);
         if walk.is_some() {
             known.walk = walk;
-            standing = known.standing(self)?;
+            standing = known.standing(self, standing)?;
         }
         let moved_back = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context.clone() };
         self.finished(2);
@@ -290,7 +292,7 @@ impl Engine<'_> {
                 true
             }
         });
-        let standing = if changed { known.standing(self)? } else { standing };
+        let standing = if changed { known.standing(self, standing)? } else { standing };
         let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
         let mut results = vec![sliding, rounding, of_coordinates, dual, by_brightness, result];
         known.displaced = displaced;
@@ -313,8 +315,7 @@ impl Engine<'_> {
         let extended = extended_toml(&diagnosis, made_from);
         (self.progress)(Stage::Verifying, 0, 1);
         let found = diagnosis.findings.iter().map(|f| f.channel).collect();
-        let places = places_of(&diagnosis.findings, context.rig);
-        let verification = Verification::new(self, &recorded, found, places);
+        let verification = Verification::new(self, &recorded, found, places_of(&diagnosis.findings, context.rig));
         let mut view = None;
         match extension {
             Extension::Given(effects) => diagnosis.gain = verification.of(effects, &remake.with(effects)?)?.gain,
@@ -333,7 +334,7 @@ impl Engine<'_> {
             rolling_shutter::Search::Found(result, slide) => (result, Some(slide)),
             rolling_shutter::Search::Undecided { found, slide, not_found } => {
                 let shift: ShownShift = &|frame, p, sensor| slide.shift_m(frame, p, sensor);
-                let moved_back = self.pair(Corrections { shift_m: Some(shift), ..Corrections::default() })?;
+                let moved_back = self.pair(Corrections { shift_m: Some(shift), ..Corrections::default() }, None)?;
                 let moved_back = Context { frames: &moved_back, ..context.clone() };
                 if search::returns::is_explained_by_displacement(context, &moved_back) {
                     (found, Some(slide))
@@ -363,15 +364,15 @@ impl Engine<'_> {
         let walk = |ray: &Ray| known.walk_m(ray);
         let walks: Option<RangeError> = if known.walk.is_some() { Some(&walk) } else { None };
         let moved = Corrections { shift_m: moves.then_some(&shift), range_m: walks, step_m: known.coarse_m() };
-        let upright = if displaced.moves() { Some(self.pair(moved)?) } else { None };
-        let context = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
-        let (packets, arrived) = search::packets::search(&context, self.sensors);
-        let seen = Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let upright = if displaced.moves() { Some(self.pair(moved, None)?) } else { None };
+        let seen = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let (packets, arrived) = search::packets::search(&seen, self.sensors);
+        let seen = Context { frames: arrived.as_deref().unwrap_or(seen.frames), ..seen };
         let (of_bright, without_halos) = search::bright_targets::search(&seen);
         let seen = Context { frames: without_halos.as_deref().unwrap_or(seen.frames), ..seen };
         let (hidden, mask) = search::mask::search(&seen, known.shown());
-        let elsewhere = known.shown() != Shown::InPlace;
-        let mut results = vec![packets, hidden, search::hits::search(&seen, &mask, elsewhere)];
+        let hits = search::hits::search(&seen, &mask, known.shown() != Shown::InPlace);
+        let mut results = vec![packets, hidden, hits];
         results.extend(of_bright);
         self.finished(5);
         results.extend([search::returns::search(&seen, Scenes::Same), search::mixed_pixels::search(&seen)]);
@@ -386,7 +387,7 @@ impl Engine<'_> {
             range_m: if displaced.has_strips() { Some(&off) } else { walks },
             step_m: known.step_m,
         };
-        let even = if uneven || known.step_m.is_some() { Some(self.pair(even)?) } else { None };
+        let even = if uneven || known.step_m != known.coarse_m() { Some(self.pair(even, upright)?) } else { upright };
         let context = Context { frames: even.as_deref().unwrap_or(context.frames), ..context.clone() };
         let vibration = search::geometry::vibration::search(&context);
         // In frames that tilt within a scan the ground is elsewhere than it is.

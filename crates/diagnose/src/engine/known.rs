@@ -56,8 +56,13 @@ impl Known {
         self.walk.map_or(0.0, |walk| walk.of(ray))
     }
 
-    /// Frames with motion distortion, range walk and coarse quantisation corrected; `None` where there is none.
-    pub(super) fn standing(&self, engine: &Engine) -> Result<Option<Vec<FramePair>>, DiagnoseError> {
+    /// Frames with motion distortion, range walk and coarse quantisation corrected, in place of others; `None` where
+    /// there is none.
+    pub(super) fn standing(
+        &self,
+        engine: &Engine,
+        others: Option<Vec<FramePair>>,
+    ) -> Result<Option<Vec<FramePair>>, DiagnoseError> {
         if self.slide.is_none() && self.walk.is_none() && self.coarse_m().is_none() {
             return Ok(None);
         }
@@ -65,7 +70,7 @@ impl Known {
         let shift_m = self.slide.as_ref().map(|_| shift);
         let walk: RangeError = &|ray| self.walk_m(ray);
         let range_m = self.walk.map(|_| walk);
-        engine.pair(Corrections { shift_m, range_m, step_m: self.coarse_m() }).map(Some)
+        engine.pair(Corrections { shift_m, range_m, step_m: self.coarse_m() }, others).map(Some)
     }
 
     /// Frames with motion distortion, range walk, quantisation and a displacement undone, that of rows as well; and
@@ -82,7 +87,7 @@ impl Known {
         };
         let walk: RangeError = &|ray| self.walk_m(ray);
         let range_m = self.walk.map(|_| walk);
-        engine.pair(Corrections { shift_m: Some(&shift), range_m, step_m: self.coarse_m() })
+        engine.pair(Corrections { shift_m: Some(&shift), range_m, step_m: self.coarse_m() }, None)
     }
 
     /// How the measured scene lies when silhouettes and single returns are compared.

@@ -25,8 +25,6 @@ pub struct FramePair {
     /// Measured returns without a counterpart. Those of a pattern that does not repeat are where the simulation has no
     /// return near, and have the surface that their own side has around them.
     pub only_measured: Vec<Ray>,
-    /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
-    pub mixed_per_rad: f64,
     /// Edges in the rows of the measured and of the simulated side, as they were recorded.
     pub edges: [RowEdges; 2],
     /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns
@@ -61,7 +59,6 @@ impl FramePair {
             id,
             measured,
             simulated,
-            mixed_per_rad: 0.0,
             edges: Default::default(),
             open: 0.0,
             second: [0.0; 2],
@@ -140,7 +137,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         uses(&measured, seen, share, [recorded.number as u64, 0]),
         uses(&simulated, |_, _, _| true, share, [recorded.number as u64, 1]),
     ];
-    let (mut rays, mut mixed_per_rad, mut shots_open): ([Vec<(Ray, Use)>; 2], f64, f64) = Default::default();
+    let (mut rays, mut shots_open): ([Vec<(Ray, Use)>; 2], f64) = Default::default();
     let mut only_measured = Vec::new();
     for (sensor, scan) in measured.iter_mut().enumerate() {
         let pair = SensorPair {
@@ -154,7 +151,6 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         let compared = pair.compare(scan, corrections.range_m, [&uses[0][sensor], &uses[1][sensor]]);
         rays.iter_mut().zip(compared.rays).for_each(|(all, own)| all.extend(own));
         only_measured.extend(compared.only_measured);
-        mixed_per_rad += compared.mixed_per_rad;
         shots_open += compared.open;
     }
     fit_objects(&mut objects, &rays, sensors);
@@ -169,7 +165,6 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         measured,
         simulated: simulated_rays,
         only_measured,
-        mixed_per_rad: mixed_per_rad / returns[1].max(1) as f64,
         edges: *recorded.edges,
         open: share * shots_open,
         second: [recorded.measured, recorded.simulated].map(|side| share * side.second as f64),
@@ -369,13 +364,12 @@ mod tests {
         let [all, some] = [usize::MAX, 3_000].map(|kept| paired(kept, Corrections::default()));
         assert_eq!(all.measured.len(), rows().len() * 500);
         let share = 3_000.0 / (rows().len() * 500) as f64;
-        assert_eq!((some.mixed_per_rad, some.open), (all.mixed_per_rad, share * all.open));
+        assert_eq!(some.open, share * all.open);
         assert_eq!((all.second, some.second), ([200.0, 100.0], [share * 200.0, share * 100.0]));
         let [of_some, of_all] = [&some, &all].map(|f| &f.objects[0]);
         assert_eq!((of_some.shift, of_some.points[0]), (of_all.shift, of_all.points[0]));
         // A false alarm far before an object is no return at it, though the surface behind it is the object's.
         assert!((of_all.points[1] - 12..=of_all.points[1]).contains(&of_some.points[1]), "{of_some:?} {of_all:?}");
-        assert!(all.mixed_per_rad > 0.0);
         assert!((all.objects[0].shift.unwrap().shift_m[0] - 0.05).abs() < 0.01, "{:?}", all.objects[0].shift);
         for (some, all) in [(&some.measured, &all.measured), (&some.simulated, &all.simulated)] {
             assert!((2_700..3_300).contains(&some.len()), "{}", some.len());

@@ -1,9 +1,10 @@
 //! Range discontinuities over which a beam meets two surfaces: how many returns it has of both, or between them, by its
 //! width.
 
+use super::prediction::Predictor;
 use super::row_edges::rows_of;
 use crate::inference::median;
-use sensor::directions::{DirectionIndex, SensorScan};
+use sensor::directions::{DirectionIndex, SensorScan, Sensors};
 
 /// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a
 /// pulse.
@@ -25,23 +26,29 @@ fn is_between(range_m: f64, near_m: f64, far_m: f64) -> bool {
     gap_mixes(near_m, far_m) && range_m > near_m + margin && range_m < far_m - margin
 }
 
+/// Share of the returns of some scans, one of each sensor, that beams would mix over the jumps between them, for each
+/// radian of their width.
+pub fn mixed_per_rad(scans: &[SensorScan], sensors: &Sensors) -> f64 {
+    let mixed: f64 = scans.iter().enumerate().map(|(sensor, scan)| mixed_of(sensors, sensor, scan)).sum();
+    mixed / scans.iter().map(SensorScan::len).sum::<usize>().max(1) as f64
+}
+
 /// The returns of a scan, and their index.
-pub(super) struct Returns<'a> {
-    pub scan: &'a SensorScan,
-    pub index: &'a DirectionIndex,
+struct Returns<'a> {
+    scan: &'a SensorScan,
+    index: &'a DirectionIndex,
 }
 
 /// Expected number of mixed returns of a sensor's scan for each radian of beam width. An edge between two
-/// neighbouring shots is hit with a probability of the beam width over their angle. `row` is the row of a return,
-/// `smooth` whether the others around it lie on one surface. Two returns of one shot are no neighbours. 0 where rows
-/// are not known.
-pub(super) fn mixed_per_rad(
-    returns: &Returns,
-    row: impl Fn(usize) -> u16,
-    mut smooth: impl FnMut(usize) -> bool,
-) -> f64 {
-    let SensorScan { azimuth_rad: azimuth, elevation_rad: elevation, .. } = returns.scan;
-    let rows = rows_of(returns.scan, row);
+/// neighbouring shots is hit with a probability of the beam width over their angle. Where the others around a return
+/// lie on one surface there is no edge. Two returns of one shot are no neighbours. 0 where rows are not known.
+fn mixed_of(sensors: &Sensors, sensor: usize, scan: &SensorScan) -> f64 {
+    let predictor = Predictor::new(sensors, sensor, scan, &[]);
+    let (mut smooth, mut neighbours) = (vec![None; scan.len()], Vec::new());
+    let mut smooth = |i: usize| *smooth[i].get_or_insert_with(|| predictor.is_smooth(scan, i, &mut neighbours));
+    let returns = Returns { scan, index: &predictor.around.index };
+    let SensorScan { azimuth_rad: azimuth, elevation_rad: elevation, .. } = scan;
+    let rows = rows_of(scan, |i| sensors.row(sensor, elevation[i]));
     let mut of_pair = |a: usize, b: usize, apart_rad: f64| {
         let mixes = returns.gap_mixes(a, b) && !smooth(a) && !smooth(b);
         if mixes { returns.mixing_share(a, b) / apart_rad.max(1e-5) } else { 0.0 }
@@ -103,5 +110,41 @@ impl Returns<'_> {
             is_between(range, below, above)
         });
         seen.count() as f64 / f64::from(PLACES)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sensor::Rig;
+    use sensor::directions::{ScanPattern, Steps};
+
+    /// A board before a wall, over some columns: its two upright edges are crossed by every row.
+    fn board(columns: std::ops::Range<usize>) -> SensorScan {
+        let mut scan = SensorScan::default();
+        for (row, column) in (0..ROWS).flat_map(|row| (0..COLUMNS).map(move |column| (row, column))) {
+            scan.elevation_rad.push(row as f32 * 0.01);
+            scan.azimuth_rad.push(column as f32 * STEP_RAD);
+            scan.range_m.push(if columns.contains(&column) { 10.0 } else { 14.0 });
+        }
+        scan
+    }
+
+    const ROWS: usize = 12;
+    const COLUMNS: usize = 200;
+    const STEP_RAD: f32 = 0.004;
+
+    #[test]
+    fn beams_mix_over_edges_as_their_width_is_to_the_step() {
+        let pattern = ScanPattern {
+            rows_rad: (0..ROWS).map(|row| row as f32 * 0.01).collect(),
+            steps: Steps { azimuth_rad: STEP_RAD, elevation_rad: 0.01 },
+        };
+        let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
+        assert_eq!(mixed_per_rad(&[board(0..0)], &sensors), 0.0);
+        let edges = 2.0 * ROWS as f64 / (f64::from(STEP_RAD) * (ROWS * COLUMNS) as f64);
+        let mixed = mixed_per_rad(&[board(80..120)], &sensors);
+        // Of the places of an edge in a beam some put the mean range onto one of both surfaces.
+        assert!((0.6 * edges..edges).contains(&mixed), "{mixed} {edges}");
     }
 }

@@ -18,7 +18,7 @@ pub use alone::{FrameAlone, frame_alone};
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
 pub use frame::{Corrections, FramePair, ObjectPair, RangeError, RecordedFrame, ShownShift, pair_frame};
 pub(crate) use frame::{alone, round_ranges};
-pub use gaps::gap_margin_m;
+pub use gaps::{gap_margin_m, mixed_per_rad};
 pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::{Matched, match_directions};
 pub use of_sensor::company_m;

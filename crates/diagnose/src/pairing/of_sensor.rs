@@ -1,7 +1,6 @@
 //! One sensor of a frame, return by return.
 
 use super::frame::{AROUND_M, RangeError};
-use super::gaps::{Returns, mixed_per_rad};
 use super::matching::Matched;
 use super::prediction::{Intensities, Predictor};
 use super::ray::Ray;
@@ -37,8 +36,6 @@ pub(super) struct Compared {
     pub rays: [Vec<(Ray, Use)>; 2],
     /// Compared measured rays without a counterpart, see [`super::FramePair::only_measured`].
     pub only_measured: Vec<Ray>,
-    /// Expected mixed simulated returns for each radian of beam width.
-    pub mixed_per_rad: f64,
     /// Shots without a simulated return.
     pub open: f64,
 }
@@ -58,13 +55,6 @@ impl SensorPair<'_> {
         let (window, edge_m) = (predictor.around.window, self.sensors.edge_m);
         Roughness { own: &own, window, edge_m, stray: &stray }
             .set([(&mut measured, &which[0], scan), (&mut simulated, &which[1], self.simulated)]);
-        let mut smooth: Vec<Option<bool>> = vec![None; self.simulated.len()];
-        which[1].iter().zip(&simulated).for_each(|(&i, ray)| smooth[i] = Some(ray.smooth));
-        let mut neighbours = Vec::new();
-        let smooth =
-            |i: usize| *smooth[i].get_or_insert_with(|| predictor.is_smooth(self.simulated, i, &mut neighbours));
-        let row = |i: usize| self.sensors.row(self.sensor, self.simulated.elevation_rad[i]);
-        let returns = Returns { scan: self.simulated, index: &predictor.around.index };
         let missing = scan.len() as f64 - self.simulated.len() as f64;
         let open = open(self.sensors, self.sensor, [scan, self.simulated], &predictor.around.index);
         let with_use = |rays: Vec<Ray>, which: &[usize], uses: &[Use]| -> Vec<(Ray, Use)> {
@@ -72,7 +62,6 @@ impl SensorPair<'_> {
         };
         Compared {
             only_measured: self.only_measured(scan, &measured, &which[0], uses[0]),
-            mixed_per_rad: mixed_per_rad(&returns, row, smooth),
             open: open.unwrap_or(missing.max(0.0)),
             rays: [with_use(measured, &which[0], uses[0]), with_use(simulated, &which[1], uses[1])],
         }

@@ -1,5 +1,6 @@
 //! The frames of both data sets, read once and held in memory for every pairing.
 
+use super::gaps::mixed_per_rad;
 use super::matching::{Matched, match_directions};
 use super::row_edges::{RowEdges, edges_of};
 use super::second::drop_second;
@@ -132,6 +133,11 @@ impl<'a> Recordings<'a> {
         let sides = [self.side(frame, PairSide::Measured)?, self.side(frame, PairSide::Simulated)?];
         let both = || sides.map(|side| edges_of(&side.scans, sensors));
         Ok(self.frames[frame].edges.get_or_init(both))
+    }
+
+    /// Share of the simulated returns of a frame that beams would mix, see [`mixed_per_rad`].
+    pub fn mixed_per_rad(&self, frame: usize, sensors: &Sensors) -> Result<f64, DiagnoseError> {
+        Ok(mixed_per_rad(&self.side(frame, PairSide::Simulated)?.scans, sensors))
     }
 }
 

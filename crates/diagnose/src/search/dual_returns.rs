@@ -1,16 +1,15 @@
 //! Second returns: shots of which one side reports two ranges, and the other one.
 
 use super::{ChannelResult, Context, Found, NamedParameter, Z_STAR, with_error};
+use crate::catalogue::sizes::SECOND_SHARE;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity, Unit};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
+use crate::error::DiagnoseError;
 use crate::inference::choice::total_and_z;
 use crate::inference::counts::gain_of_count;
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
-
-/// Smallest difference of the shares of second returns that is reported: one in a thousand shots.
-const FLOOR: f64 = 1e-3;
 
 /// Share of second returns that chance may make, for gains.
 const BY_CHANCE: f64 = 1e-4;
@@ -18,14 +17,21 @@ const BY_CHANCE: f64 = 1e-4;
 /// Widest beam of a LiDAR, rad.
 const WIDEST_RAD: f64 = 0.02;
 
-/// The search.
-pub fn search(context: &Context) -> ChannelResult {
+/// The search. `mixed_per_rad` is the share of the simulated returns of a frame that beams would mix, see
+/// [`crate::pairing::mixed_per_rad`].
+///
+/// # Errors
+/// Those of `mixed_per_rad`.
+pub fn search(
+    context: &Context,
+    mixed_per_rad: impl Fn(usize) -> Result<f64, DiagnoseError>,
+) -> Result<ChannelResult, DiagnoseError> {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Returns, hold_out.len());
     let differences = |of: &[usize]| of.iter().map(|&i| difference(&context.frames[i])).collect::<Vec<f64>>();
     let (total, z) = total_and_z(&differences(&select));
     let more = total / select.len().max(1) as f64;
-    let chosen = more.abs() > FLOOR && z.abs() > Z_STAR;
+    let chosen = more.abs() > SECOND_SHARE && z.abs() > Z_STAR;
     result.considered.push(Considered {
         cause: Cause::DualReturns.into(),
         channel: Channel::Returns,
@@ -33,15 +39,16 @@ pub fn search(context: &Context) -> ChannelResult {
         z,
         outcome: if chosen { "chosen" } else { "both sides have as many second returns" }.into(),
     });
-    result.minimum.push((Cause::DualReturns, Minimum::new(Quantity::Share, FLOOR)));
+    result.minimum.push((Cause::DualReturns, Minimum::new(Quantity::Share, SECOND_SHARE)));
     if !chosen {
-        return result;
+        return Ok(result);
     }
     let each = differences(&estimate);
     let (total, z) = total_and_z(&each);
     let more = total / each.len().max(1) as f64;
     let held: Vec<f64> = hold_out.iter().map(|&i| gain(&context.frames[i])).collect();
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [*g; 3]);
+    let mixed = estimate.iter().map(|&i| mixed_per_rad(i)).collect::<Result<Vec<f64>, _>>()?;
     let says = match more > 0.0 {
         true => format!(
             "{:.1} % of the measured shots have a second return behind the first; your simulator has one return a shot",
@@ -52,7 +59,7 @@ pub fn search(context: &Context) -> ChannelResult {
     result.found.push(Found {
         status: Status::Named,
         causes: vec![Cause::DualReturns],
-        parameters: parameters(context, &estimate, more, more.abs() / z.abs().max(1e-9)),
+        parameters: parameters(statistics::mean(&mixed), more, more.abs() / z.abs().max(1e-9)),
         confidence: 1.0,
         channel: Channel::Returns,
         covariate: Covariate::Edge,
@@ -62,7 +69,7 @@ pub fn search(context: &Context) -> ChannelResult {
         curve: curve(context, &estimate),
         effects: Vec::new(),
     });
-    result
+    Ok(result)
 }
 
 /// Interval of the width of beams as multiples of the width of those that report each second surface they meet. A
@@ -70,10 +77,10 @@ pub fn search(context: &Context) -> ChannelResult {
 /// for the errors of the gaps that are counted.
 const WIDER: [f64; 2] = [0.75, 4.0];
 
-/// The share of second returns, and the full width of a beam that meets two surfaces as often.
-fn parameters(context: &Context, frames: &[usize], more: f64, error: f64) -> Vec<NamedParameter> {
+/// The share of second returns, and the full width of a beam that meets two surfaces as often, where a share `mixed`
+/// of the returns does so for each radian.
+fn parameters(mixed: f64, more: f64, error: f64) -> Vec<NamedParameter> {
     let mut parameters = vec![(Quantity::Share.into(), with_error(more, error, Unit::One))];
-    let mixed = frames.iter().map(|&i| context.frames[i].mixed_per_rad).sum::<f64>() / frames.len().max(1) as f64;
     if more > 0.0 && mixed > 0.0 {
         let width = (more / mixed).min(WIDEST_RAD);
         let ci95 = WIDER.map(|times| times * width);

@@ -131,7 +131,6 @@ pub(super) fn as_pairs(ids: &[String], sides: [Vec<FrameAlone>; 2]) -> (Vec<Fram
         id: id.clone(),
         measured,
         simulated,
-        mixed_per_rad: 0.0,
         edges,
         open: 0.0,
         second: [0.0; 2],

@@ -192,6 +192,7 @@ impl<'a> Search<'a> {
             || displaced.drift != [0.0; COURSES]
             || displaced.swept().is_some()
         {
+            self.undone = None;
             let frames = undo(&displaced)?;
             let context = Context { frames: &frames, ..self.context.clone() };
             self.sums = sums(&context, &self.select, &displaced, &self.swept);
