@@ -1,7 +1,8 @@
 //! The smallest and the largest range that are measured.
 
+use crate::catalogue::sizes::CUT_SHARE;
 use crate::inference::simplex::minimise;
-use crate::pairing::{FramePair, Ray, Surface};
+use crate::pairing::{FramePair, OCTANTS, Ray, Surface};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use statistics::{blocks_of, deviation, draw_blocks};
@@ -85,11 +86,11 @@ fn cut(frames: &[FramePair], which: &[usize], end: End) -> Option<RangeEnd> {
         let lost = above(&b, 1.01 * at);
         let beyond = above(&a, 1.01 * at) / lost.max(1.0);
         let before = above(&b, 0.9 * at) - above(&b, 0.995 * at);
-        if lost < 60.0 || lost < 0.0015 * b.len() as f64 || beyond > 0.05 || before < 40.0 {
+        if lost < 60.0 || lost < CUT_SHARE * b.len() as f64 || beyond > 0.05 || before < 40.0 {
             return None;
         }
         let end_m = value(at);
-        let step = SoftStep::fit(&sum_of(counts_about(frames, which, end_m).iter()), end);
+        let step = SoftStep::fit(&sum_of(counts_about(frames, which, end_m).iter().flatten()), end);
         let found = RangeEnd { at_m: end_m * (1.0 + step.middle), width: step.width };
         (step.width < WIDEST && step.usual > LEAST_USUAL).then_some(found)
     })
@@ -138,8 +139,9 @@ const REPETITIONS: usize = 60;
 /// Simulated returns by bins around an end: those with a measured counterpart in their direction, and those without.
 type Counts = [[f64; BINS]; 2];
 
-/// The range at which half of the returns are lost, and its standard error over blocks of frames, m. The threshold of a
-/// receiver is soft: returns become fewer over some range. The share of the simulated returns that have a counterpart
+/// The range at which half of the returns are lost, and its standard error, m: over blocks of frames, or over the
+/// directions about the vehicle, which show other surfaces, whichever is larger. The threshold of a receiver is soft:
+/// returns become fewer over some range. The share of the simulated returns that have a counterpart
 /// is a normal distribution function of the range, whose middle and width are fitted. `end_m` is about where the end
 /// is.
 ///
@@ -147,26 +149,32 @@ type Counts = [[f64; BINS]; 2];
 /// simulated rings are moved to where the measured ones are.
 pub fn half_point(frames: &[FramePair], which: &[usize], blocks: &[usize], end_m: f64, end: End) -> [f64; 2] {
     let each = counts_about(frames, which, end_m);
-    let fit = |drawn: &[usize]| end_m * (1.0 + SoftStep::fit(&sum_of(drawn.iter().map(|&i| &each[i])), end).middle);
+    let fit_counts = |counts: &Counts| end_m * (1.0 + SoftStep::fit(counts, end).middle);
+    let fit = |drawn: &[usize]| fit_counts(&sum_of(drawn.iter().flat_map(|&i| &each[i])));
     let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose end of ranges", 0, 0);
     let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
     let again: Vec<f64> = draws.par_iter().map(|drawn| fit(drawn)).collect();
-    [fit(&(0..which.len()).collect::<Vec<_>>()), deviation(&again)]
+    let in_octant = |k: usize| sum_of(each.iter().map(|octants| &octants[k]));
+    let octants: Vec<Counts> = (0..OCTANTS).map(in_octant).filter(|c| c.iter().flatten().any(|n| *n > 0.0)).collect();
+    let without = |k: usize| fit_counts(&sum_of(octants.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, c)| c)));
+    let jackknife: Vec<f64> = (0..octants.len()).into_par_iter().map(without).collect();
+    let over_octants = (jackknife.len() as f64 - 1.0).max(0.0).sqrt() * deviation(&jackknife);
+    [fit(&(0..which.len()).collect::<Vec<_>>()), deviation(&again).max(over_octants)]
 }
 
-/// Counts about an end of each frame.
-fn counts_about(frames: &[FramePair], which: &[usize], end_m: f64) -> Vec<Counts> {
+/// Counts about an end of each frame, by octant.
+fn counts_about(frames: &[FramePair], which: &[usize], end_m: f64) -> Vec<[Counts; OCTANTS]> {
     let bin = |range_m: f64| {
         let at = (range_m / end_m - 1.0) / BIN + 0.5 * BINS as f64;
         (0.0..BINS as f64).contains(&at).then_some(at as usize)
     };
     let of_frame = |&i: &usize| {
-        let mut counts: Counts = [[0.0; BINS]; 2];
+        let mut counts = [[[0.0; BINS]; 2]; OCTANTS];
         let ground = GroundMoved::new(&frames[i].measured, 2.0 * end_m);
         for ray in frames[i].simulated.iter().filter(|r| r.company >= 2) {
             if let Some(k) = bin(ray.own_range_m() + ground.range_m(ray)) {
-                counts[usize::from(!ray.matched)][k] += 1.0;
+                counts[ray.octant()][usize::from(!ray.matched)][k] += 1.0;
             }
         }
         counts
@@ -189,13 +197,13 @@ impl GroundMoved {
     /// From the measured returns up to a range, m.
     fn new(measured: &[Ray], until_m: f64) -> GroundMoved {
         let mut sums = BTreeMap::<u8, (Matrix3<f64>, Vector3<f64>)>::new();
-        let near = |r: &&Ray| is_ground(r) && r.own_range_m() < until_m && r.across_m().abs() < MOST_MOVED_M;
+        let near = |r: &&Ray| is_ground(r) && r.own_range_m() < until_m && r.across_nearest_m().abs() < MOST_MOVED_M;
         for ray in measured.iter().filter(near) {
             let x = terms(ray);
             // One metre for each coefficient, from a return with a standard deviation of a decimetre.
             let sum = sums.entry(ray.sensor).or_insert((Matrix3::identity() * 0.01, Vector3::zeros()));
             sum.0 += x * x.transpose();
-            sum.1 += x * ray.across_m();
+            sum.1 += x * ray.across_nearest_m();
         }
         let solved =
             |(sensor, (gram, right)): (u8, (Matrix3<f64>, Vector3<f64>))| Some((sensor, gram.try_inverse()? * right));
