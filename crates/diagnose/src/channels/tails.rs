@@ -3,8 +3,9 @@
 //!
 //! The usual roughness is the median over the shots before and after in the same row: it follows what a surface, its
 //! brightness and its incidence do to the noise. It is at least that of the noisier side at such ranges and angles:
-//! what is uneven in the world is off by the same lengths on both sides, and is a tail on both or on neither. A return
-//! beyond [`BEYOND`] standard deviations of it is in the tail.
+//! what is uneven in the world is off by the same lengths on both sides, and is a tail on both or on neither. It is
+//! also at least what a neighbour that is far off makes of it. A return beyond [`BEYOND`] standard deviations of it is
+//! in the tail.
 
 use super::cells::{cell, place_of};
 use super::roughness::own_roughness_m;
@@ -14,18 +15,23 @@ use rayon::prelude::*;
 /// Standard deviations from which on a return is in the tail.
 pub const BEYOND: f64 = 6.0;
 
-/// Smallest distance of a return in the tail from its surface, m. A neighbour that is off by less than what makes an
-/// edge, 0.12 m, draws the surface by up to half of that.
-pub const LEAST_OFF_M: f64 = 0.06;
+/// Smallest distance of a return in the tail from its surface, along the ray, m: walls have a relief, of which the two
+/// sides show different parts.
+const LEAST_OFF_M: f64 = 0.06;
 
-/// Shots before and after one that tell the usual roughness.
+/// Distance across a surface from which on a neighbour makes an edge, m. One that is off by less draws the surface by
+/// its weight in the mean, which is at most the square root of [`Ray::roughness_leverage`]: at grazing incidence by
+/// much along the ray.
+const EDGE_M: f64 = 0.12;
+
+/// Shots before and after one whose surface it may be part of: where it is far off they have none, or are drawn to it.
+const BESIDE: usize = 2;
+
+/// Shots before and after these that tell the usual roughness.
 const AROUND: usize = 8;
 
 /// Fewest of these with a roughness.
 const FEWEST: usize = 10;
-
-/// Smallest usual roughness, m: a surface that is even to the last digit has no noise.
-const LEAST_M: f64 = 0.002;
 
 /// Bins of the logarithm of the usual roughness: four for each factor of 2, from 1 mm.
 const BINS: usize = 40;
@@ -138,22 +144,25 @@ fn tails_of(rays: &[Ray], scales: &[f64]) -> [Tail; KINDS] {
     let (mut before, mut around) = (false, Vec::with_capacity(2 * AROUND));
     for (i, (ray, own)) in shots.iter().enumerate() {
         let row = |j: &usize| shots[*j].0.row == ray.row && shots[*j].0.sensor == ray.sensor;
-        let window = i.saturating_sub(AROUND)..(i + AROUND + 1).min(shots.len());
+        let window = i.saturating_sub(BESIDE + AROUND)..(i + BESIDE + AROUND + 1).min(shots.len());
         around.clear();
-        around.extend(window.filter(|j| *j != i).filter(row).filter_map(|j| shots[j].1).map(f64::abs));
-        let (Some(own), true) = (own, around.len() >= FEWEST) else {
+        let apart = |j: &usize| j.abs_diff(i) > BESIDE;
+        around.extend(window.filter(apart).filter(row).filter_map(|j| shots[j].1).map(f64::abs));
+        let (Some(own), Some((range_m, cos, _)), true) = (own, place_of(ray), around.len() >= FEWEST) else {
             before = false;
             continue;
         };
         let half = around.len() / 2;
         let median = *around.select_nth_unstable_by(half, f64::total_cmp).1;
         let of_cell_m = cell(ray).map_or(0.0, |c| scales[c]);
-        let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(of_cell_m).max(LEAST_M);
+        let drawn_m = EDGE_M * f64::from(ray.roughness_leverage).sqrt() / cos;
+        let least_m = drawn_m.max(LEAST_OFF_M) / BEYOND;
+        let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(of_cell_m).max(least_m);
         // The distance itself: a single error has no part in the surface, whose own error the usual ones have.
         let times = (1.0 + f64::from(ray.roughness_leverage)).sqrt();
         let [off_m, usual_m] = [times * own.abs(), times * usual_m];
-        let beyond = off_m > (BEYOND * usual_m).max(LEAST_OFF_M);
-        let most_m = place_of(ray).map_or(0.0, |(range_m, cos, _)| most_m(range_m, cos));
+        let beyond = off_m > BEYOND * usual_m;
+        let most_m = most_m(range_m, cos);
         if off_m > most_m {
             before = false;
             continue;
@@ -174,4 +183,44 @@ fn tails_of(rays: &[Ray], scales: &[f64]) -> [Tail; KINDS] {
         before = beyond;
     }
     of_kinds
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    /// A row of a wall 10 m away with 8 mm of noise. One return is off by so much; the shots beside it have no surface.
+    fn row_with(off_m: f32, cos_incidence: f32) -> Tail {
+        let ray = |k: i32| {
+            let azimuth = 0.003 * f64::from(k);
+            let beside = (18..=22).contains(&k) && k != 20;
+            let roughness_m = match k {
+                20 => off_m,
+                _ if beside => f32::NAN,
+                _ => 0.008 * if k % 2 == 0 { 1.0 } else { -1.0 },
+            };
+            let ray = Ray::standing(&(Vector3::new(azimuth.cos(), azimuth.sin(), 0.0) * 10.0));
+            Ray { roughness_m, roughness_leverage: 0.1, cos_incidence, ..ray }
+        };
+        let rays: Vec<Ray> = (0..40).map(ray).collect();
+        let [_, standing, _] = tails_of(&rays, &vec![0.0; super::super::cells::CELLS]);
+        standing
+    }
+
+    #[test]
+    fn a_far_return_counts_where_those_beside_it_have_no_surface() {
+        let tail = row_with(0.3, 1.0);
+        assert_eq!((tail.beyond, tail.sizes[size_bin(0.3)]), (1.0, 1.0), "{tail:?}");
+        let near = row_with(0.008, 1.0);
+        assert_eq!((near.beyond, near.all), (0.0, tail.all));
+    }
+
+    #[test]
+    fn what_a_far_neighbour_does_to_a_surface_at_grazing_incidence_is_no_tail() {
+        // 0.12 m across the surface, of which the square root of 0.1 may be in its mean: 19 cm along the ray.
+        let [square, grazing] = [1.0, 0.2].map(|cos| row_with(0.15, cos));
+        assert_eq!([square.beyond, grazing.beyond], [1.0, 0.0]);
+        assert_eq!(row_with(0.25, 0.2).beyond, 1.0);
+    }
 }

@@ -1,6 +1,6 @@
 //! Tails of range noise as a mixture: larger errors of single shots, and returns that are spread evenly about surfaces.
 
-use crate::channels::tails::{BEYOND, FrameTails, KINDS, LEAST_OFF_M, SIZES, Tail, TailBin, size_m};
+use crate::channels::tails::{BEYOND, FrameTails, KINDS, SIZES, Tail, TailBin, size_m};
 use crate::inference::counts::{likelihood_beside, likelihood_of_counts};
 use crate::inference::simplex::minimise;
 
@@ -112,7 +112,7 @@ fn expected(usual: &[Usual], mixture: &Mixture) -> [f64; SIZES] {
     for Usual { distance_m, within } in usual {
         let beyond = |size_m: f64| mixture.law.beyond(size_m, *distance_m, mixture.std_m);
         for (bin, sum) in out.iter_mut().enumerate().filter(|(bin, _)| within[*bin] > 0.0) {
-            let [from, to] = [size_m(bin).max(BEYOND * distance_m).max(LEAST_OFF_M), size_m(bin + 1)];
+            let [from, to] = [size_m(bin).max(BEYOND * distance_m), size_m(bin + 1)];
             if from < to {
                 // What is spread evenly alone has no law.
                 let of_law = if mixture.share > 0.0 { beyond(from) - beyond(to) } else { 0.0 };
@@ -138,6 +138,8 @@ pub(super) struct Fit {
     pub(super) mixture: Mixture,
     /// With normal ones, as the simulator has them.
     pub(super) normal: Mixture,
+    /// Share and standard deviation of the errors, m: the mean of both laws by their likelihoods.
+    pub(super) numbers: [f64; 2],
     /// What the law makes of share and standard deviation: half of the difference between both laws.
     pub(super) of_law: [f64; 2],
     /// What is likeliest without a tail: false alarms, droplets and parts of things beside surfaces alone.
@@ -167,6 +169,8 @@ impl Fit {
         };
         let [(normal, by_normal), (laplace, by_laplace)] = [Law::Normal, Law::Laplace].map(fitted);
         let mixture = if by_normal <= by_laplace { normal } else { laplace };
+        let of_normal = 1.0 / (1.0 + (by_normal - by_laplace).exp());
+        let mean = |of: fn(&Mixture) -> f64| of_normal * of(&normal) + (1.0 - of_normal) * of(&laplace);
         let (alone, by_stray) = minimise(&[share.ln()], &[0.5], |p| surprise(&stray(p)));
         let without = stray(&alone);
         let fit = Fit {
@@ -175,6 +179,7 @@ impl Fit {
             evidence: by_stray - by_normal.min(by_laplace),
             mixture,
             normal,
+            numbers: [mean(|m| m.share), mean(|m| m.std_m)],
             of_law: [normal.share - laplace.share, normal.std_m - laplace.std_m].map(|d| 0.5 * d.abs()),
             without,
         };
@@ -252,11 +257,11 @@ mod tests {
             let frame =
                 |sides: [&Tail; 2]| -> FrameTails { [sides.map(Tail::clone), Default::default(), Default::default()] };
             let fit = Fit::of(&[&frame([&with, &without])]).unwrap();
-            let (found, [of_share, of_std]) = (fit.mixture, fit.of_law);
+            let (found, [share, std_m], [of_share, of_std]) = (fit.mixture, fit.numbers, fit.of_law);
             assert!(stray > 0.0 || found.law == law, "{found:?}");
             // Beside what is spread evenly the law is hard to tell.
-            assert!((found.share - truth.share).abs() < 0.1 * truth.share + 2.0 * of_share, "{found:?} {of_share}");
-            assert!((found.std_m - truth.std_m).abs() < 0.1 * truth.std_m + 2.0 * of_std, "{found:?} {of_std}");
+            assert!((share - truth.share).abs() < 0.1 * truth.share + 2.0 * of_share, "{share} {of_share}");
+            assert!((std_m - truth.std_m).abs() < 0.1 * truth.std_m + 2.0 * of_std, "{std_m} {of_std}");
             assert!(Fit::of(&[&frame([&without, &with])]).is_none(), "the simulated side has them");
         }
     }

@@ -1,6 +1,7 @@
 //! Noise with heavy tails: single returns that are much farther off than the others.
 
 use super::mixture::{Fit, Mixture};
+use crate::catalogue::sizes::{TAILS_MORE, TAILS_SHARE};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::roughness::{CAP, RoughFrame};
 use crate::channels::tails::{BEYOND, FrameTails, Tail, most_m, tails};
@@ -17,18 +18,12 @@ use sensor::Effect;
 use sensor::effects::HeavyTails;
 use statistics::{blocks_of, deviation, draw_blocks};
 
-/// Smallest share of the returns in the tail that is reported.
-const FLOOR: f64 = 3e-4;
-
 /// Least evidence on the selecting and on the estimating frames, nats. Of 20 pairs of the second generator without
 /// heavy tails one had more than 8 on both, 11.6 and 14.5.
 const LEAST_NATS: f64 = 12.0;
 
 /// Relative error of share and standard deviation by the law: errors of sensors have neither of both.
 const OF_FORM: f64 = 0.1;
-
-/// Excess of the measured tails that is reported, as a share of those of the simulated side.
-const SHARE_OF_BASE: f64 = 0.2;
 
 /// Share of tails right after one from which on shots are not independent: noise that depends on the surface is large
 /// on a dark surface, shot after shot. The surface through the neighbours of a far return is drawn to it, so that some
@@ -60,7 +55,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     let clustered = clustering(&on_select);
     let outcome = if evidence.min(again) < LEAST_NATS || !significant(&gains, Z_STAR) {
         "no more of them than on the simulated side, but for what is spread evenly about surfaces"
-    } else if share < FLOOR.max(SHARE_OF_BASE * base) {
+    } else if share < TAILS_SHARE.max(TAILS_MORE * base) {
         "too few to speak of"
     } else if std_m > STRAY_M {
         "spread evenly around surfaces: droplets or false alarms"
@@ -70,7 +65,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
         "chosen"
     };
     result.consider(Cause::HeavyTails, (evidence, z), context.returns(&select), outcome);
-    result.minimum.push((Cause::HeavyTails, Minimum::new(Quantity::Share, FLOOR.max(SHARE_OF_BASE * base))));
+    result.minimum.push((Cause::HeavyTails, Minimum::new(Quantity::Share, TAILS_SHARE.max(TAILS_MORE * base))));
     let Some(fitted) = on_others else { return 0.0 };
     if outcome != "chosen" {
         if clustered <= INDEPENDENT {
@@ -78,20 +73,19 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
         }
         return 0.0;
     }
-    let found = fitted.mixture;
     let held: Vec<f64> = tail(&hold_out).iter().map(|t| fitted.gain(t)).collect();
     for (d, gain) in result.distance.iter_mut().zip(&held) {
         *d = [d[0] + gain.max(0.0), d[1] + gain, d[2] + gain];
     }
     take_out(rough, scales, fitted.mixture, leverage);
     let by_chance = errors(&on_estimate, &context.blocks(&estimate));
-    let of_form = [found.share, found.std_m].map(|value| OF_FORM * value);
+    let of_form = fitted.numbers.map(|value| OF_FORM * value);
     let errors = [0, 1].map(|k| by_chance[k].hypot(fitted.of_law[k]).hypot(of_form[k]));
     // The simulator has normal errors.
     let Mixture { share, std_m, .. } = fitted.normal;
     let effect = Effect::HeavyTails(HeavyTails { probability: rounded(share, 6), std_m: rounded(std_m, 4) });
-    result.found.push(Found { effects: vec![effect], ..describe(found, errors, &on_estimate, held, z) });
-    leverage * found.share * found.std_m * found.std_m
+    result.found.push(Found { effects: vec![effect], ..describe(fitted.numbers, errors, &on_estimate, held, z) });
+    leverage * fitted.mixture.share * fitted.mixture.std_m.powi(2)
 }
 
 /// Shares of the simulated and of the measured returns in the tail.
@@ -148,13 +142,18 @@ fn errors(tails: &[&FrameTails], blocks: &[usize]) -> [f64; 2] {
     let mut rng = data::stream(0, "diagnose tails", 0, 0);
     let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
     let again = |drawn: &Vec<usize>| Fit::of(&drawn.iter().map(|&i| tails[i]).collect::<Vec<_>>());
-    let fits: Vec<Mixture> = draws.par_iter().filter_map(again).map(|fit| fit.mixture).collect();
-    let error = |of: fn(&Mixture) -> f64| deviation(&fits.iter().map(of).collect::<Vec<_>>());
-    if fits.is_empty() { [0.0; 2] } else { [error(|t| t.share), error(|t| t.std_m)] }
+    let fits: Vec<[f64; 2]> = draws.par_iter().filter_map(again).map(|fit| fit.numbers).collect();
+    let error = |of: usize| deviation(&fits.iter().map(|numbers| numbers[of]).collect::<Vec<_>>());
+    if fits.is_empty() { [0.0; 2] } else { [0, 1].map(error) }
 }
 
-fn describe(tails: Mixture, errors: [f64; 2], on_estimate: &[&FrameTails], held_out_gains: Vec<f64>, z: f64) -> Found {
-    let Mixture { share, std_m, .. } = tails;
+fn describe(
+    [share, std_m]: [f64; 2],
+    errors: [f64; 2],
+    on_estimate: &[&FrameTails],
+    held_out_gains: Vec<f64>,
+    z: f64,
+) -> Found {
     let number: f64 = on_estimate.iter().copied().flatten().map(|t| t[0].beyond).sum();
     let relative = 1.0 / number.max(1.0).sqrt();
     let [simulated, measured] = shares(on_estimate);
