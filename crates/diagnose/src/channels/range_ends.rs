@@ -298,6 +298,27 @@ mod tests {
         }
     }
 
+    /// In all frames the walls on one side lie 10 cm farther away than simulated: frames do not tell that, sides do.
+    #[test]
+    fn directions_that_disagree_are_an_error_of_the_end() {
+        let frame = |off_m: f64| {
+            let ray = |azimuth: f64, range_m: f64| {
+                let end_m = if azimuth > 0.0 { 6.0 + off_m } else { 6.0 };
+                let place = Vector3::new(azimuth.cos(), azimuth.sin(), 0.0) * range_m;
+                Ray { matched: range_m > end_m, ..Ray::standing(&place) }
+            };
+            let simulated = (0..8 * 200).map(|k| ray(0.75 * f64::from(k % 8) - 2.6, 5.0 + 0.01 * f64::from(k / 8)));
+            FramePair::of_rays(String::new(), vec![], simulated.collect())
+        };
+        let of = |off_m: f64| {
+            let frames = vec![frame(off_m); 6];
+            half_point(&frames, &[0, 1, 2, 3, 4, 5], &[0, 1, 2, 3, 4, 5], 6.0, End::Near)
+        };
+        let [[same_m, alike], [middle_m, error]] = [of(0.0), of(0.1)];
+        assert!((same_m - 6.0).abs() < 0.01 && alike < 0.01, "{same_m} {alike}");
+        assert!((middle_m - 6.05).abs() < 2.0 * error && (0.01..0.05).contains(&error), "{middle_m} {error}");
+    }
+
     #[test]
     fn rings_of_the_ground_are_moved_with_the_sensor() {
         let height_m = 1.8;

@@ -53,6 +53,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     let [base, share] = fitted.map_or([0.0; 2], |fit| fit.shares(&on_select));
     let std_m = fitted.map_or(0.0, |fit| fit.mixture.std_m);
     let clustered = clustering(&on_select);
+    let mut errors = [0.0; 2];
     let outcome = if evidence.min(again) < LEAST_NATS || !significant(&gains, Z_STAR) {
         "no more of them than on the simulated side, but for what is spread evenly about surfaces"
     } else if share < TAILS_SHARE.max(TAILS_MORE * base) {
@@ -62,7 +63,9 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     } else if clustered > INDEPENDENT {
         "the next shot is as far off: noise that depends on the surface"
     } else {
-        "chosen"
+        errors = on_others.map_or(errors, |fit| errors_of(&fit, &on_estimate, &context.blocks(&estimate)));
+        let sure = on_others.is_some_and(|fit| fit.numbers[0] > 1.96 * errors[0]);
+        if sure { "chosen" } else { "there may be none" }
     };
     result.consider(Cause::HeavyTails, (evidence, z), context.returns(&select), outcome);
     result.minimum.push((Cause::HeavyTails, Minimum::new(Quantity::Share, TAILS_SHARE.max(TAILS_MORE * base))));
@@ -78,9 +81,6 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
         *d = [d[0] + gain.max(0.0), d[1] + gain, d[2] + gain];
     }
     take_out(rough, scales, fitted.mixture, leverage);
-    let by_chance = errors(&on_estimate, &context.blocks(&estimate));
-    let of_form = fitted.numbers.map(|value| OF_FORM * value);
-    let errors = [0, 1].map(|k| by_chance[k].hypot(fitted.of_law[k]).hypot(of_form[k]));
     // The simulator has normal errors.
     let Mixture { share, std_m, .. } = fitted.normal;
     let effect = Effect::HeavyTails(HeavyTails { probability: rounded(share, 6), std_m: rounded(std_m, 4) });
@@ -136,15 +136,18 @@ fn take_out(rough: &mut [RoughFrame], scales: &[f64], mixture: Mixture, leverage
 /// Bootstrap repetitions for intervals.
 const REPETITIONS: usize = 40;
 
-/// Standard errors of share and standard deviation, over blocks of frames.
-fn errors(tails: &[&FrameTails], blocks: &[usize]) -> [f64; 2] {
+/// Standard errors of share and standard deviation: over blocks of frames, and of the law.
+fn errors_of(fitted: &Fit, tails: &[&FrameTails], blocks: &[usize]) -> [f64; 2] {
     let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose tails", 0, 0);
     let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
     let again = |drawn: &Vec<usize>| Fit::of(&drawn.iter().map(|&i| tails[i]).collect::<Vec<_>>());
     let fits: Vec<[f64; 2]> = draws.par_iter().filter_map(again).map(|fit| fit.numbers).collect();
-    let error = |of: usize| deviation(&fits.iter().map(|numbers| numbers[of]).collect::<Vec<_>>());
-    if fits.is_empty() { [0.0; 2] } else { [0, 1].map(error) }
+    let by_chance = |k: usize| deviation(&fits.iter().map(|numbers| numbers[k]).collect::<Vec<_>>());
+    [0, 1].map(|k| {
+        let of_law = fitted.of_law[k].hypot(OF_FORM * fitted.numbers[k]);
+        if fits.is_empty() { of_law } else { of_law.hypot(by_chance(k)) }
+    })
 }
 
 fn describe(
