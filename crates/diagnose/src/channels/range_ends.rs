@@ -129,9 +129,12 @@ pub enum End {
     Far,
 }
 
-/// Bins around an end, and their width as a share of its range.
-const BINS: usize = 60;
-const BIN: f64 = 0.006;
+/// Bins around an end, and their width as a share of its range: a sharp end lies anywhere between the middles of two.
+const BINS: usize = 360;
+const BIN: f64 = 0.001;
+
+/// Width of a step from which on its fit begins, as a share of the range.
+const FIRST_WIDTH: f64 = 0.012;
 
 /// Bootstrap repetitions for the error of an end.
 const REPETITIONS: usize = 60;
@@ -258,7 +261,7 @@ impl SoftStep {
             };
             (0..BINS).map(of_bin).sum::<f64>()
         };
-        let (p, _) = minimise(&[0.0, (2.0 * BIN).ln(), 2.0, -4.0], &[2.0 * BIN, 0.7, 1.0, 1.0], surprise);
+        let (p, _) = minimise(&[0.0, FIRST_WIDTH.ln(), 2.0, -4.0], &[FIRST_WIDTH, 0.7, 1.0, 1.0], surprise);
         SoftStep { middle: p[0], width: p[1].exp(), usual: share(p[2]) }
     }
 }
