@@ -11,6 +11,7 @@ use super::cells::{cell, place_of};
 use super::roughness::own_roughness_m;
 use crate::pairing::{FramePair, Ray, STRAY_M, Surface, company_m};
 use rayon::prelude::*;
+use sensor::directions::EDGE_M;
 
 /// Standard deviations from which on a return is in the tail.
 pub const BEYOND: f64 = 6.0;
@@ -18,11 +19,6 @@ pub const BEYOND: f64 = 6.0;
 /// Smallest distance of a return in the tail from its surface, along the ray, m: walls have a relief, of which the two
 /// sides show different parts.
 const LEAST_OFF_M: f64 = 0.06;
-
-/// Distance across a surface from which on a neighbour makes an edge, m. One that is off by less draws the surface by
-/// its weight in the mean, which is at most the square root of [`Ray::roughness_leverage`]: at grazing incidence by
-/// much along the ray.
-const EDGE_M: f64 = 0.12;
 
 /// Shots before and after one whose surface it may be part of: where it is far off they have none, or are drawn to it.
 const BESIDE: usize = 2;
@@ -155,6 +151,8 @@ fn tails_of(rays: &[Ray], scales: &[f64]) -> [Tail; KINDS] {
         let half = around.len() / 2;
         let median = *around.select_nth_unstable_by(half, f64::total_cmp).1;
         let of_cell_m = cell(ray).map_or(0.0, |c| scales[c]);
+        // A neighbour that is less than an edge off draws the surface by its weight in the mean, which is at most the
+        // root of its variance: at grazing incidence by much along the ray.
         let drawn_m = EDGE_M * f64::from(ray.roughness_leverage).sqrt() / cos;
         let least_m = drawn_m.max(LEAST_OFF_M) / BEYOND;
         let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(of_cell_m).max(least_m);
