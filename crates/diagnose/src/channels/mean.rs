@@ -325,9 +325,20 @@ pub fn origins(rig: &Rig) -> Vec<Point3<f64>> {
 }
 
 impl MeanFrame {
+    /// No sums of some columns.
+    pub fn zeros(columns: usize) -> MeanFrame {
+        MeanFrame { gram: DMatrix::zeros(columns, columns), right: DVector::zeros(columns) }
+    }
+
+    /// Adds the sums of other rays.
+    pub fn add(&mut self, other: &MeanFrame) {
+        self.gram += &other.gram;
+        self.right += &other.right;
+    }
+
     /// The covariance of the frame's own pose and displacement over a scan, given all columns; `prior` holds the
     /// variances of their parameters.
-    fn of_own(&self, prior: &SVector<f64, OWN>) -> Option<DMatrix<f64>> {
+    pub fn of_own(&self, prior: &SVector<f64, OWN>) -> Option<DMatrix<f64>> {
         let mut own = self.gram.view((0, 0), (OWN, OWN)).into_owned();
         for k in 0..OWN {
             own[(k, k)] += 1.0 / prior[k].max(1e-16);

@@ -4,8 +4,9 @@
 
 use super::groups::{Group, PARTS, Seen, part_of};
 use super::mean::{KINDS, OwnPoses, kind_of, origins, usable, weight};
+use crate::inference::banded::Cholesky;
 use crate::pairing::{FramePair, Surface};
-use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
+use nalgebra::{Matrix2, Vector2};
 use rayon::prelude::*;
 use sensor::Rig;
 use std::collections::BTreeMap;
@@ -73,37 +74,51 @@ impl Band {
         self.fitted(precision, 1.0).0
     }
 
-    /// The same with the likeliest prior of some standard deviations: those of `widest` and halves, quarters and so on
-    /// of them. Priors are in units of the variance of what is measured, which is `variance`. Rows that are known worse
+    /// The likeliest prior precisions of those of some standard deviations: the `widest` and halves, quarters and so on
+    /// of them. They are in units of the variance of what is measured, which is `variance`. Rows that are known worse
     /// than they scatter would predict what is chance.
-    pub fn shrunk(&self, widest: [Option<f64>; COLUMNS], variance: f64) -> Offsets {
+    pub fn likeliest(&self, widest: [Option<f64>; COLUMNS], variance: f64) -> [Option<f64>; COLUMNS] {
         let halved = |k: i32| widest.map(|precision| precision.map(|p| p * 4f64.powi(k)));
-        let fits = (0..PRIORS).map(|k| self.fitted(halved(k), variance));
-        fits.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(offsets, _)| offsets).unwrap_or_default()
+        let tried = (0..PRIORS).map(|k| (halved(k), self.fitted(halved(k), variance).1));
+        tried.max_by(|a, b| a.1.total_cmp(&b.1)).map_or(widest, |(precision, _)| precision)
     }
 
-    /// Offsets of the rows in some columns, for the prior precision of each, with the logarithm of the probability of
-    /// what is measured, but for a constant; 0 and impossible where they cannot be solved for.
+    /// What another band is likelier by with offsets as far as this one knows them, for the prior precision of each
+    /// column, than without any, nats. Offsets that are hardly known predict next to nothing.
+    pub fn predicts(&self, other: &Band, precision: [Option<f64>; COLUMNS], variance: f64) -> f64 {
+        let mut both = self.clone();
+        both.merge(other);
+        both.fitted(precision, variance).1 - self.fitted(precision, variance).1
+    }
+
+    /// Offsets of the rows in some columns, for the prior precision of each, with the logarithm of what is measured
+    /// being likelier with such offsets than without any; 0 and impossible where they cannot be solved for.
     fn fitted(&self, precision: [Option<f64>; COLUMNS], variance: f64) -> (Offsets, f64) {
         let rows = self.right.len();
         let fitted: Vec<(usize, f64)> =
             precision.iter().enumerate().filter_map(|(c, precision)| Some((c, (*precision)?))).collect();
-        let place = |i: usize| (i / fitted.len().max(1), fitted[i % fitted.len().max(1)]);
-        let n = rows * fitted.len();
-        let gram = DMatrix::from_fn(n, n, |i, j| {
-            let ((row, (a, precision)), (other, (b, _))) = (place(i), place(j));
-            let ((first, a), (last, b)) = if row <= other { ((row, a), (other, b)) } else { ((other, b), (row, a)) };
-            let shared = if last - first < WIDE { self.gram[first][last - first][a][b] } else { 0.0 };
-            shared + if i == j { precision } else { 0.0 }
-        });
-        let right = DVector::from_fn(n, |i, _| self.right[place(i).0][place(i).1.0]);
         let mut out: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
-        let Some(cholesky) = gram.cholesky() else { return (out, f64::NEG_INFINITY) };
+        let each = fitted.len();
+        if each == 0 {
+            return (out, 0.0);
+        }
+        let element = |i: usize, j: usize| {
+            let ((a, precision), (b, _)) = (fitted[i % each], fitted[j % each]);
+            let apart = i / each - j / each;
+            let shared = if apart < WIDE { self.gram[j / each][apart][b][a] } else { 0.0 };
+            shared + if i == j { precision } else { 0.0 }
+        };
+        let right: Vec<f64> = (0..rows * each).map(|i| self.right[i / each][fitted[i % each].0]).collect();
+        let Some(cholesky) = Cholesky::new(right.len(), WIDE * each - 1, element) else {
+            return (out, f64::NEG_INFINITY);
+        };
         let solved = cholesky.solve(&right);
-        (0..n).for_each(|i| out[place(i).1.0][place(i).0] = solved[i]);
+        for (i, offset) in solved.iter().enumerate() {
+            out[fitted[i % each].0][i / each] = *offset;
+        }
         let of_priors = rows as f64 * fitted.iter().map(|(_, precision)| precision.ln()).sum::<f64>();
-        let of_sums = cholesky.ln_determinant();
-        (out, 0.5 * (of_priors - of_sums + right.dot(&solved) / variance))
+        let squares: f64 = right.iter().zip(&solved).map(|(right, offset)| right * offset).sum();
+        (out, 0.5 * (of_priors - cholesky.ln_determinant() + squares / variance))
     }
 
     /// Gain by offsets, nats.
@@ -343,14 +358,16 @@ mod tests {
         // Both columns together explain no more than the one that is there.
         let both = test.gain(&train.offsets([Some(100.0), Some(1e4)]));
         assert!((both / test.gain(&offsets) - 1.0).abs() < 0.05, "{both}");
-        // With a prior that is much too wide nothing is gained: rows of which little is known predict chance.
-        let [wide, shrunk] = [train.offsets([Some(1e-2), None]), train.shrunk([Some(1e-2), None], 1.0)];
-        assert!(test.gain(&shrunk) >= test.gain(&wide), "{} {}", test.gain(&shrunk), test.gain(&wide));
+        // What is known is gained, but for what it costs to be uncertain; the likeliest prior gains no less.
+        let gained = train.predicts(&test, only, 1.0);
+        assert!((gained / test.gain(&offsets) - 1.0).abs() < 0.1, "{gained} {}", test.gain(&offsets));
+        let wide = [Some(1e-2), None];
+        assert!(train.predicts(&test, train.likeliest(wide, 1.0), 1.0) >= train.predicts(&test, wide, 1.0));
         let nothing: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.0)).collect();
-        let of_nothing = total(nothing[..10].iter(), 0, &|_| true).offsets(only);
-        assert!(total(nothing[10..].iter(), 0, &|_| true).gain(&of_nothing) < 8.0);
-        let shrunk = total(nothing[..10].iter(), 0, &|_| true).shrunk(only, 1.0);
-        assert!(total(nothing[10..].iter(), 0, &|_| true).gain(&shrunk).abs() < 2.0);
+        let [train, test] = [&nothing[..10], &nothing[10..]].map(|frames| total(frames.iter(), 0, &|_| true));
+        assert!(train.predicts(&test, wide, 1.0) < 0.0);
+        let gained = train.predicts(&test, train.likeliest(only, 1.0), 1.0);
+        assert!((-8.0..2.0).contains(&gained), "{gained}");
         // What the patches leave is the noise.
         let [squares, freedom] = nothing.iter().fold([0.0; 2], |s, f| [s[0] + f.squares, s[1] + f.freedom]);
         assert!((squares / freedom - 1.0).abs() < 0.1, "{}", squares / freedom);

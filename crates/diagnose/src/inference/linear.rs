@@ -55,15 +55,20 @@ pub fn fit(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize], precisi
         n += 1.0;
     }
     let sandwich = &inverse * scatter * &inverse * (n / (n - 1.0).max(1.0));
-    let mut covariance = inverse;
+    LinearFit { columns: columns.to_vec(), theta, covariance: at_least(inverse, &sandwich) }
+}
+
+/// A covariance with every variance at least that of another one.
+pub fn at_least(mut covariance: DMatrix<f64>, other: &DMatrix<f64>) -> DMatrix<f64> {
+    let k = covariance.nrows();
     for i in 0..k {
-        let grow = (sandwich[(i, i)] / covariance[(i, i)].max(1e-300)).max(1.0).sqrt();
+        let grow = (other[(i, i)] / covariance[(i, i)].max(1e-300)).max(1.0).sqrt();
         for j in 0..k {
             covariance[(i, j)] *= grow;
             covariance[(j, i)] *= grow;
         }
     }
-    LinearFit { columns: columns.to_vec(), theta, covariance }
+    covariance
 }
 
 impl LinearFit {

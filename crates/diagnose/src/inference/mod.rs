@@ -1,5 +1,6 @@
 //! Fits of causes and the choice between them.
 
+pub mod banded;
 pub mod choice;
 pub mod comb;
 pub mod counts;

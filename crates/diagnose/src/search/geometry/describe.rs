@@ -1,5 +1,6 @@
 //! Findings of geometry: parameters, sentences and plots.
 
+use super::beside_rows;
 use super::curve::linear_curve;
 use super::floor::{FLOOR_GROUPS, FLOOR_SWEEP};
 use super::hypotheses::Hypothesis;
@@ -87,7 +88,8 @@ fn drift(sums: &Sums, columns: &[usize], parameters: &[NamedParameter]) -> Optio
 /// Describes a linear hypothesis.
 fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis]) -> Description {
     let (sums, rig) = (&search.sums, search.context.rig);
-    let fitted = sums.fit_all(&search.estimate, &search.estimate_blocks, chosen);
+    let reported = search.reported.as_ref().map(|reported| reported.linear.clone());
+    let fitted = reported.unwrap_or_else(|| sums.fit_all(&search.estimate, &search.estimate_blocks, chosen));
     let spurious = spurious_poses(search, columns, chosen);
     let parameters = linear_parameters(sums, rig, &fitted, columns, spurious, cause);
     let is_sensor = |id: &ParameterId| *id == ParameterId::Of(Quantity::Sensor);
@@ -136,12 +138,7 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
 /// Describes offsets of groups of rays, of rows together with what else was chosen.
 fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chosen: &[Hypothesis]) -> Description {
     let ((std, n), mut offsets) = match grouping {
-        Grouping::Row => {
-            let rows = search.sums.rows(&search.estimate, column, chosen);
-            // Errors of ranges are independent from row to row, those of elevations may be along a line.
-            let spread = if column == 0 { grouped::spread_of_rows } else { grouped::spread_of_smooth_rows };
-            (spread(&rows), rows)
-        }
+        Grouping::Row => beside_rows::rows(search, column, chosen),
         Grouping::Azimuth | Grouping::Range => strips(search, grouping, column),
     };
     let error = std / (2.0 * n.max(1.0)).sqrt();

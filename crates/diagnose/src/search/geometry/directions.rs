@@ -2,10 +2,13 @@
 //! has it does so in all frames that show it: frames do not tell that from an error of the sensor or of the vehicle,
 //! but other directions do, which show other surfaces.
 
+use super::Search;
+use super::beside_rows::BesideRows;
 use super::hypotheses::Hypothesis;
 use super::sums::Sums;
-use crate::channels::mean::{Compared, OWN};
+use crate::channels::mean::{MeanFrame, OWN};
 use crate::inference::choice::directions_agree;
+use crate::inference::linear::LinearFit;
 use crate::pairing::OCTANTS;
 use crate::search::Context;
 use nalgebra::{DMatrix, DVector};
@@ -48,7 +51,7 @@ fn by_direction(
     let taken_up = sums.taken_up(&gram, &(&gram * &effect), &others);
     others.iter().zip(taken_up.iter()).for_each(|(&c, by)| effect[c] -= by);
     theta -= &sums.undone;
-    let compared = Compared { rig: context.rig, columns: &sums.columns, noise_m: sums.noise_m, design: sums.design };
+    let compared = sums.compared(context.rig);
     let of_frame = |&f: &usize| {
         let mean = &sums.whole[f];
         let taken_up = mean.own(&sums.own_prior, &(&mean.gram * &effect));
@@ -68,4 +71,82 @@ fn by_direction(
         [0, 1].map(|i: usize| std::array::from_fn(|k| a[i][k] + b[i][k]))
     };
     frames.par_iter().map(of_frame).reduce(Default::default, add)
+}
+
+/// Covariance of a fit on the estimating frames by what leaving out each direction changes (jackknife): errors of the
+/// surfaces in one direction are the same in all frames. Zero where fewer than three directions show a surface.
+/// Offsets of rows that were fitted as well are integrated out.
+pub(super) fn scatter(search: &Search, fitted: &LinearFit, rows: Option<&BesideRows>) -> DMatrix<f64> {
+    let k = fitted.columns.len();
+    let mut theta = DVector::zeros(search.sums.columns.len());
+    fitted.columns.iter().zip(fitted.theta.iter()).for_each(|(&c, by)| theta[c] += by);
+    let context = search.paired();
+    let nothing = || vec![(DMatrix::zeros(k, k), DVector::zeros(k), 0.0); OCTANTS];
+    let of_frame = |&f: &usize| {
+        let of_directions = in_directions(search, &context, f, (fitted, &theta), rows);
+        let mut out = nothing();
+        for (left_out, (gram, score, seen)) in out.iter_mut().enumerate() {
+            let others = of_directions.iter().enumerate().filter(|(d, _)| *d != left_out);
+            let mut all = MeanFrame::zeros(OWN + k);
+            others.for_each(|(_, direction)| all.add(direction));
+            let (all, right) = all.without_own(&search.sums.own_prior);
+            (*gram, *score) = (all.view((OWN, OWN), (k, k)).into_owned(), right.rows(OWN, k).into_owned());
+            *seen = of_directions[left_out].gram.trace();
+        }
+        out
+    };
+    let mut without = search.estimate.par_iter().map(of_frame).reduce(nothing, |mut a, b| {
+        for ((gram, score, seen), (more, other, by)) in a.iter_mut().zip(b) {
+            *gram += more;
+            *score += other;
+            *seen += by;
+        }
+        a
+    });
+    without.retain(|(.., seen)| *seen > 0.0);
+    let n = without.len() as f64;
+    let precision = |i: usize| search.sums.precision[fitted.columns[i]];
+    let prior = DMatrix::from_diagonal(&DVector::from_fn(k, |i, _| precision(i)));
+    let of_prior = &prior * &fitted.theta;
+    let changes: Option<Vec<DVector<f64>>> =
+        without.iter().map(|(gram, score, _)| (gram + &prior).lu().solve(&(score - &of_prior))).collect();
+    let Some(changes) = changes.filter(|changes| changes.len() > 2) else { return DMatrix::zeros(k, k) };
+    let middle = changes.iter().sum::<DVector<f64>>() / n;
+    let squares = changes.iter().map(|change| (change - &middle) * (change - &middle).transpose());
+    squares.sum::<DMatrix<f64>>() * ((n - 1.0) / n)
+}
+
+/// Sums of each direction of a frame, of what the fit leaves: by what the frame has of its own, then by the columns of
+/// the fit.
+fn in_directions(
+    search: &Search,
+    context: &Context,
+    frame: usize,
+    (fitted, theta): (&LinearFit, &DVector<f64>),
+    rows: Option<&BesideRows>,
+) -> Vec<MeanFrame> {
+    let sums = &search.sums;
+    let size = OWN + fitted.columns.len();
+    let place: Vec<Option<usize>> =
+        (0..sums.columns.len()).map(|c| fitted.columns.iter().position(|f| *f == c)).collect();
+    let theta = theta - &sums.undone;
+    let compared = sums.compared(context.rig);
+    let mut out = vec![MeanFrame::zeros(size); OCTANTS];
+    let mut levers = DVector::zeros(size);
+    let (pose, moment) = (&sums.poses[frame], &sums.moments.of_frames[frame]);
+    compared.for_each(&context.frames[frame], pose, moment, |ray, x, y, w| {
+        levers.fill(0.0);
+        for &(c, v) in x {
+            if c < OWN {
+                levers[c] = v;
+            }
+            place[c].into_iter().for_each(|i| levers[OWN + i] = v);
+        }
+        let by_columns: f64 = x.iter().map(|&(c, v)| v * theta[c]).sum();
+        let by_row = rows.map_or(0.0, |rows| rows.add_response(ray, &mut levers.rows_mut(OWN, size - OWN)));
+        let direction = &mut out[ray.octant()];
+        direction.gram.ger(w, &levers, &levers, 1.0);
+        direction.right.axpy(w * (y - by_columns - by_row), &levers, 1.0);
+    });
+    out
 }

@@ -167,6 +167,7 @@ mod tests {
             whole: vec![MeanFrame { gram: gram.clone(), right: DVector::zeros(4) }],
             own_prior: SVector::zeros(),
             undone: DVector::zeros(4),
+            undone_rows: Default::default(),
             noise_m: 0.01,
             design: 1.0,
             linear: vec![LinearFrame { gram, right: DVector::zeros(4) }],

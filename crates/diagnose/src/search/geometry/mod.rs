@@ -1,6 +1,7 @@
 //! Where surfaces lie: range biases, poses of sensors and of the ego vehicle, rows that aim or measure wrongly, and
 //! unexplained offsets by azimuth or by range.
 
+mod beside_rows;
 mod common_turns;
 mod curve;
 mod describe;
@@ -10,6 +11,7 @@ mod floor;
 pub mod ground;
 mod hypotheses;
 mod own_scatter;
+mod reported;
 mod row_offsets;
 mod rows;
 mod selection;
@@ -24,6 +26,7 @@ use self::common_turns::common_turns;
 use self::displacement::displacement;
 use self::floor::above_floor;
 use self::hypotheses::Hypothesis;
+use self::reported::Reported;
 use self::sums::{Sums, sums};
 use super::confounders::is_confirmed;
 use super::rolling_shutter::Slide;
@@ -56,6 +59,8 @@ struct Search<'a> {
     estimate_blocks: Vec<usize>,
     hold_out: Vec<usize>,
     demands: Demands,
+    /// What is reported of the chosen hypotheses, once there are any.
+    reported: Option<Reported>,
     /// Simulated returns of the selecting frames.
     returns: f64,
 }
@@ -139,6 +144,7 @@ pub fn search(context: &Context, slide: Option<&Slide>, undo: Undo) -> Result<Ge
         search.select_beside(&mut chosen, &mut result);
     }
     let (chosen, selected) = search.large_enough(search.still_significant(chosen));
+    search.reported = Some(Reported::new(&search, &chosen));
     let gains: Vec<Vec<f64>> = chosen.iter().map(|hypothesis| search.held_out_gains(hypothesis, &chosen)).collect();
     result.distance = search.distances(&chosen, &gains);
     for ((hypothesis, selected), gains) in chosen.iter().zip(selected).zip(gains) {
@@ -166,6 +172,7 @@ impl<'a> Search<'a> {
             blocks: context.blocks(&select),
             estimate_blocks: context.blocks(&estimate),
             demands: first_demands(),
+            reported: None,
             returns: context.returns(&select),
             select,
             estimate,

@@ -4,18 +4,21 @@ use super::displacement::Displacement;
 use super::hypotheses::Hypothesis;
 use super::own_scatter::own_scatter;
 use super::row_offsets::row_offsets;
-use crate::channels::groups::{Group, GroupFrame, Grouping, PARTS, PartedFrame, Seen, group_frames, total, whole};
+use crate::channels::groups::{
+    Group, GroupFrame, Grouping, PARTS, PartedFrame, Seen, Undone, group_frames, total, whole,
+};
 use crate::channels::mean::{
     Column, Compared, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, origins, own_poses, usual_noise_m,
 };
 use crate::channels::moments::Moments;
-use crate::channels::row_patches::{self, Band, Offsets, RowFrame, row_frames};
+use crate::channels::row_patches::{self, RowFrame, row_frames};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_expected, cross_gains, fit, fold_of};
 use crate::inference::median;
 use crate::search::Context;
 use nalgebra::{DVector, SVector};
 use rayon::prelude::*;
+use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// Sums of all frames.
@@ -35,6 +38,8 @@ pub(super) struct Sums {
     pub(super) own_prior: SVector<f64, OWN>,
     /// What was undone before the frames were paired, by column.
     pub(super) undone: DVector<f64>,
+    /// Offsets of rows that were undone as well.
+    pub(super) undone_rows: Undone,
     /// Range noise of the simulated side, m.
     pub(super) noise_m: f64,
     /// Variance of means over patches of directions, in units of that of independent residuals.
@@ -115,6 +120,7 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
         whole: means,
         own_prior: prior,
         undone: by_columns,
+        undone_rows: undone.rows.clone(),
         noise_m,
         design,
         poses,
@@ -213,6 +219,11 @@ pub(super) fn group_fit(column: usize) -> GroupFit {
 }
 
 impl Sums {
+    /// What the rays of frames are compared by.
+    pub(super) fn compared<'a>(&'a self, rig: &'a Rig) -> Compared<'a> {
+        Compared { rig, columns: &self.columns, noise_m: self.noise_m, design: self.design }
+    }
+
     /// Cross-validated gains of the selecting frames over the base model, nats.
     pub(super) fn gains(&self, select: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> Vec<f64> {
         let (columns, groups) = split(hypotheses);
@@ -264,10 +275,10 @@ impl Sums {
             let train = || (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &self.rows[select[i]]);
             for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
                 let others = row_patches::total(train(), sensor, &|p| p != part);
-                let offsets = others.shrunk(precisions(columns, self.of_patches), self.of_patches);
+                let priors = others.likeliest(precisions(columns, self.of_patches), self.of_patches);
                 for i in (0..select.len()).filter(|&i| folds[i] == fold) {
                     let band = &self.rows[select[i]].sensors[sensor][part];
-                    out[i] += band.gain(&offsets) / self.of_patches;
+                    out[i] += others.predicts(band, priors, self.of_patches);
                 }
             }
         }
@@ -353,19 +364,20 @@ impl Sums {
 
     /// Gains of frames by the offsets of rows among the chosen hypotheses, fitted together, nats.
     fn gains_of_rows(&self, estimate: &[usize], frames: &[usize], chosen: &[Hypothesis]) -> Vec<f64> {
-        let offsets = |c: usize| (c, self.offsets(estimate, Grouping::Row, group_fit(c), chosen));
-        let fits: Vec<(usize, BTreeMap<Group, f64>)> = row_columns(chosen).into_iter().map(offsets).collect();
-        let of_sensor = |(sensor, parts): (usize, &[Band; PARTS])| -> f64 {
-            let rows = parts.iter().map(Band::rows).max().unwrap_or(0);
-            let mut of_rows: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
-            for (column, offsets) in &fits {
-                let of = |row| offsets.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
-                of_rows[*column] = (0..rows).map(of).collect();
+        let columns = row_columns(chosen);
+        let mut out = vec![0.0; frames.len()];
+        if columns.is_empty() {
+            return out;
+        }
+        for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
+            let known = row_patches::total(estimate.iter().map(|&f| &self.rows[f]), sensor, &|_| true);
+            let priors = known.likeliest(precisions(&columns, self.of_patches), self.of_patches);
+            for (gain, &f) in out.iter_mut().zip(frames) {
+                let band = row_patches::total(std::iter::once(&self.rows[f]), sensor, &|_| true);
+                *gain += known.predicts(&band, priors, self.of_patches);
             }
-            parts.iter().map(|band| band.gain(&of_rows)).sum()
-        };
-        let of_frame = |&f: &usize| self.rows[f].sensors.iter().enumerate().map(of_sensor).sum::<f64>();
-        frames.iter().map(|f| of_frame(f) / self.of_patches).collect()
+        }
+        out
     }
 
     /// Fits of all columns and of the base model alone.
