@@ -38,7 +38,7 @@ use std::collections::BTreeSet;
 use std::io::{Read, Seek, SeekFrom};
 
 /// Returns that are kept of each side over all frames. More do not improve findings, and memory stays bounded.
-const KEPT: usize = 3_000_000;
+const KEPT: usize = 2_500_000;
 
 /// Frames that the scan patterns are estimated from.
 const PATTERN_FRAMES: usize = 10;
