@@ -78,7 +78,9 @@ pub fn direction_losses(frames: &[FramePair], which: &[usize], mask: &Mask, usua
         b.iter().for_each(|(k, v)| a.entry(*k).or_default().add(v));
         a
     };
-    which.par_iter().map(one).reduce(DirectionLosses::new, merge)
+    // In the order of the frames: sums must not depend on the number of threads.
+    let all: Vec<DirectionLosses> = which.par_iter().map(one).collect();
+    all.into_iter().fold(DirectionLosses::new(), merge)
 }
 
 /// Sum over some cells.

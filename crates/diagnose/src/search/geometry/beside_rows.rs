@@ -78,8 +78,7 @@ impl Places {
 
 /// The fit on the estimating frames; `None` where no offsets of rows are among the chosen hypotheses.
 pub(super) fn fit(search: &Search, chosen: &[Hypothesis]) -> Option<BesideRows> {
-    let columns = row_columns(chosen);
-    let sums = &search.sums;
+    let (sums, columns) = (&search.sums, row_columns(chosen));
     let mut groups: Vec<Group> = search
         .estimate
         .iter()
@@ -87,10 +86,10 @@ pub(super) fn fit(search: &Search, chosen: &[Hypothesis]) -> Option<BesideRows> 
         .collect();
     groups.sort_unstable();
     groups.dedup();
-    let places = Places { columns, groups };
-    if places.len() == 0 {
+    if columns.is_empty() || groups.is_empty() {
         return None;
     }
+    let places = Places { columns, groups };
     let linear = sums.fit_all(&search.estimate, &search.estimate_blocks, chosen).columns;
     let paired = search.paired();
     let of_frame = |&f: &usize| row_sums(search, &paired, f, &places, &linear);

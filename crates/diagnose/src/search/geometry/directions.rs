@@ -70,7 +70,9 @@ fn by_direction(
     let add = |a: [[f64; OCTANTS]; 2], b: [[f64; OCTANTS]; 2]| {
         [0, 1].map(|i: usize| std::array::from_fn(|k| a[i][k] + b[i][k]))
     };
-    frames.par_iter().map(of_frame).reduce(Default::default, add)
+    // In the order of the frames: sums must not depend on the number of threads.
+    let all: Vec<[[f64; OCTANTS]; 2]> = frames.par_iter().map(of_frame).collect();
+    all.into_iter().fold(Default::default(), add)
 }
 
 /// Covariance of a fit on the estimating frames by what leaving out each direction changes (jackknife): errors of the
@@ -95,14 +97,15 @@ pub(super) fn scatter(search: &Search, fitted: &LinearFit, rows: Option<&BesideR
         }
         out
     };
-    let mut without = search.estimate.par_iter().map(of_frame).reduce(nothing, |mut a, b| {
-        for ((gram, score, seen), (more, other, by)) in a.iter_mut().zip(b) {
+    let frames: Vec<Vec<(DMatrix<f64>, DVector<f64>, f64)>> = search.estimate.par_iter().map(of_frame).collect();
+    let mut without = nothing();
+    for frame in frames {
+        for ((gram, score, seen), (more, other, by)) in without.iter_mut().zip(frame) {
             *gram += more;
             *score += other;
             *seen += by;
         }
-        a
-    });
+    }
     without.retain(|(.., seen)| *seen > 0.0);
     let n = without.len() as f64;
     let precision = |i: usize| search.sums.precision[fitted.columns[i]];
