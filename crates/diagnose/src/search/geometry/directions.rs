@@ -83,36 +83,35 @@ pub(super) fn scatter(search: &Search, fitted: &LinearFit, rows: Option<&BesideR
     let mut theta = DVector::zeros(search.sums.columns.len());
     fitted.columns.iter().zip(fitted.theta.iter()).for_each(|(&c, by)| theta[c] += by);
     let context = search.paired();
-    let nothing = || vec![(DMatrix::zeros(k, k), DVector::zeros(k), 0.0); OCTANTS];
+    let nothing = || vec![(MeanFrame::zeros(k), 0.0); OCTANTS];
     let of_frame = |&f: &usize| {
         let of_directions = in_directions(search, &context, f, (fitted, &theta), rows);
         let mut out = nothing();
-        for (left_out, (gram, score, seen)) in out.iter_mut().enumerate() {
+        for (left_out, (sums, seen)) in out.iter_mut().enumerate() {
             let others = of_directions.iter().enumerate().filter(|(d, _)| *d != left_out);
             let mut all = MeanFrame::zeros(OWN + k);
             others.for_each(|(_, direction)| all.add(direction));
-            let (all, right) = all.without_own(&search.sums.own_prior);
-            (*gram, *score) = (all.view((OWN, OWN), (k, k)).into_owned(), right.rows(OWN, k).into_owned());
+            let (gram, right) = all.without_own(&search.sums.own_prior);
+            *sums = MeanFrame { gram: gram.view((OWN, OWN), (k, k)).into(), right: right.rows(OWN, k).into() };
             *seen = of_directions[left_out].gram.trace();
         }
         out
     };
-    let frames: Vec<Vec<(DMatrix<f64>, DVector<f64>, f64)>> = search.estimate.par_iter().map(of_frame).collect();
+    let frames: Vec<Vec<(MeanFrame, f64)>> = search.estimate.par_iter().map(of_frame).collect();
     let mut without = nothing();
     for frame in frames {
-        for ((gram, score, seen), (more, other, by)) in without.iter_mut().zip(frame) {
-            *gram += more;
-            *score += other;
+        for ((sums, seen), (more, by)) in without.iter_mut().zip(frame) {
+            sums.add(&more);
             *seen += by;
         }
     }
-    without.retain(|(.., seen)| *seen > 0.0);
+    without.retain(|(_, seen)| *seen > 0.0);
     let n = without.len() as f64;
     let precision = |i: usize| search.sums.precision[fitted.columns[i]];
     let prior = DMatrix::from_diagonal(&DVector::from_fn(k, |i, _| precision(i)));
     let of_prior = &prior * &fitted.theta;
     let changes: Option<Vec<DVector<f64>>> =
-        without.iter().map(|(gram, score, _)| (gram + &prior).lu().solve(&(score - &of_prior))).collect();
+        without.iter().map(|(sums, _)| (&sums.gram + &prior).lu().solve(&(&sums.right - &of_prior))).collect();
     let Some(changes) = changes.filter(|changes| changes.len() > 2) else { return DMatrix::zeros(k, k) };
     let middle = changes.iter().sum::<DVector<f64>>() / n;
     let squares = changes.iter().map(|change| (change - &middle) * (change - &middle).transpose());

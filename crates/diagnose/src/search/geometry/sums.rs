@@ -11,7 +11,7 @@ use crate::channels::mean::{
     Column, Compared, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, origins, own_poses, usual_noise_m,
 };
 use crate::channels::moments::Moments;
-use crate::channels::row_patches::{self, RowFrame, row_frames};
+use crate::channels::row_patches::{self, Band, Offsets, RowFrame, row_frames};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_expected, cross_gains, fit, fold_of};
 use crate::inference::median;
@@ -364,20 +364,19 @@ impl Sums {
 
     /// Gains of frames by the offsets of rows among the chosen hypotheses, fitted together, nats.
     fn gains_of_rows(&self, estimate: &[usize], frames: &[usize], chosen: &[Hypothesis]) -> Vec<f64> {
-        let columns = row_columns(chosen);
-        let mut out = vec![0.0; frames.len()];
-        if columns.is_empty() {
-            return out;
-        }
-        for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
-            let known = row_patches::total(estimate.iter().map(|&f| &self.rows[f]), sensor, &|_| true);
-            let priors = known.likeliest(precisions(&columns, self.of_patches), self.of_patches);
-            for (gain, &f) in out.iter_mut().zip(frames) {
-                let band = row_patches::total(std::iter::once(&self.rows[f]), sensor, &|_| true);
-                *gain += known.predicts(&band, priors, self.of_patches);
+        let offsets = |c: usize| (c, self.offsets(estimate, Grouping::Row, group_fit(c), chosen));
+        let fits: Vec<(usize, BTreeMap<Group, f64>)> = row_columns(chosen).into_iter().map(offsets).collect();
+        let of_sensor = |(sensor, parts): (usize, &[Band; PARTS])| -> f64 {
+            let rows = parts.iter().map(Band::rows).max().unwrap_or(0);
+            let mut of_rows: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
+            for (column, offsets) in &fits {
+                let of = |row| offsets.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
+                of_rows[*column] = (0..rows).map(of).collect();
             }
-        }
-        out
+            parts.iter().map(|band| band.gain(&of_rows)).sum()
+        };
+        let of_frame = |&f: &usize| self.rows[f].sensors.iter().enumerate().map(of_sensor).sum::<f64>();
+        frames.iter().map(|f| of_frame(f) / self.of_patches).collect()
     }
 
     /// Fits of all columns and of the base model alone.
