@@ -37,7 +37,8 @@ use sensor::directions::{SensorScan, Sensors};
 use std::collections::BTreeSet;
 use std::io::{Read, Seek, SeekFrom};
 
-/// Returns that are kept of each side over all frames. More do not improve findings, and memory stays bounded.
+/// Returns that are kept of each side over all frames. More do not improve findings, and memory stays bounded: 200
+/// frames of 75,000 shots have to fit into 4 GiB.
 const KEPT: usize = 2_500_000;
 
 /// Frames that the scan patterns are estimated from.
