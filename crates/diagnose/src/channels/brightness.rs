@@ -2,7 +2,8 @@
 //! surface. A surface that stands elsewhere than in the simulation displaces both alike, whatever its brightness.
 
 use super::intensity::Column;
-use super::mean::{KINDS, OwnPoses, kind_of, off_surface_m, origins, usable, weight};
+use super::mean::{KINDS, kind_of, usable, weight};
+use super::own_poses::{OwnPoses, mounts, off_surface_m};
 use crate::pairing::{FramePair, OCTANTS, Ray};
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
@@ -172,11 +173,11 @@ pub fn bright_frames(
     brightness: &Brightnesses,
     noise_m: f64,
 ) -> Vec<BrightFrame> {
-    let origins = origins(rig);
+    let mounts = mounts(rig);
     let one = |(frame, pose): (&FramePair, &OwnPoses)| {
         let mut patches = BTreeMap::<(u8, usize, usize, [i32; 2]), (f64, SMatrix<f64, OF_PATCH, OF_PATCH>)>::new();
         for ray in frame.measured.iter().filter(|r| usable(r)) {
-            let Some(y) = off_surface_m(ray, &origins[usize::from(ray.sensor)], pose) else { continue };
+            let Some(y) = off_surface_m(ray, &mounts[usize::from(ray.sensor)], pose) else { continue };
             let Some(bright) = brightness.on_a_plane(ray) else { continue };
             let at = [ray.azimuth_rad, ray.elevation_rad].map(f64::from);
             let place = [0, 1].map(|k| (at[k] / PATCH_RAD[k]).floor() as i32);
@@ -225,7 +226,7 @@ fn without_common(mut sums: SMatrix<f64, OF_PATCH, OF_PATCH>) -> (SMatrix<f64, O
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::channels::mean::OWN_NUMBERS;
+    use crate::channels::own_poses::OWN_NUMBERS;
     use nalgebra::Vector3;
     use sensor::Rig;
 

@@ -1,13 +1,15 @@
 //! Offsets of groups of rays: rows of a sensor, strips of azimuth, or steps of range. Each group has one range offset,
 //! and rows have one elevation offset as well. The pose error of each frame is subtracted before.
 
-use super::mean::{KINDS, OwnPoses, off_surface_m, usable, weight};
+use super::mean::{KINDS, usable, weight};
+use super::own_poses::{Mount, OwnPoses, off_surface_m};
 use crate::catalogue::Covariate;
 use crate::pairing::{FramePair, Ray};
-use nalgebra::{Point3, UnitQuaternion, Vector3};
+use nalgebra::{UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use sensor::Rig;
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 /// How rays are grouped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -209,10 +211,10 @@ impl Seen<'_> {
         &self,
         ray: &Ray,
         poses: &OwnPoses,
-        origin: &Point3<f64>,
+        mount: &Mount,
         turn: &UnitQuaternion<f64>,
     ) -> Option<(f64, [f64; 2])> {
-        let y = off_surface_m(ray, origin, poses)?;
+        let y = off_surface_m(ray, mount, poses)?;
         let x = [ray.range_lever(), elevation_lever(ray, turn)];
         let of_row = self.undone.get(&Group { sensor: ray.sensor, index: ray.row });
         let undone = of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad);
@@ -220,16 +222,16 @@ impl Seen<'_> {
     }
 }
 
-/// Sums of all frames.
+/// Sums of the returns from surfaces of some kinds (see [`super::mean::kind_of`]) of all frames.
 pub fn group_frames(
     frames: &[FramePair],
     rig: &Rig,
     seen: Seen,
-    grouping: Grouping,
+    (grouping, kinds): (Grouping, Range<usize>),
     noise_m: f64,
     design: f64,
 ) -> Vec<PartedFrame> {
-    let origins = super::mean::origins(rig);
+    let mounts = super::own_poses::mounts(rig);
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let of_sensor = grouping.most();
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
@@ -238,8 +240,12 @@ pub fn group_frames(
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let Some(group) = group_of(ray, grouping) else { continue };
             let sensor = ray.sensor as usize;
-            let Some((y, x)) = seen.across(ray, poses, &origins[sensor], &turns[sensor]) else { continue };
-            let y = y - seen.structure[super::mean::kind_of(ray)];
+            let Some((y, x)) = seen.across(ray, poses, &mounts[sensor], &turns[sensor]) else { continue };
+            let kind = super::mean::kind_of(ray);
+            if !kinds.contains(&kind) {
+                continue;
+            }
+            let y = y - seen.structure[kind];
             let w = weight(ray, noise_m) / design;
             sums[sensor][usize::from(group.index)][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {
                 gram: [w * x[0] * x[0], w * x[0] * x[1], w * x[1] * x[1]],

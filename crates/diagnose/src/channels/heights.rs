@@ -1,10 +1,11 @@
 //! Heights of the ground over the simulated one, frame by frame: with the pose that each frame has of its own taken
 //! out, and what is the same in the vehicle's axes in all frames.
 
-use super::mean::{OwnPoses, off_surface_m, origins, own_poses, usable, usual_noise_m, weight};
+use super::mean::{usable, usual_noise_m, weight};
+use super::own_poses::{Mount, OwnPoses, mounts, off_surface_m, own_poses};
 use crate::inference::median;
 use crate::pairing::{FramePair, Ray, Surface};
-use nalgebra::{Point3, Vector2};
+use nalgebra::Vector2;
 use rayon::prelude::*;
 use sensor::Rig;
 use std::collections::BTreeMap;
@@ -29,10 +30,10 @@ pub type Heights = BTreeMap<Cell, [f64; 2]>;
 
 /// Heights of each frame by the cell of a return and its place in the vehicle's axes, m.
 pub fn heights(frames: &[FramePair], rig: &Rig, cell_of: impl Fn(&Ray, &Vector2<f64>) -> Cell + Sync) -> Vec<Heights> {
-    let (origins, noise_m) = (origins(rig), usual_noise_m(frames));
+    let (mounts, noise_m) = (mounts(rig), usual_noise_m(frames));
     let of_frame = |frame: &FramePair| {
-        let pose = own_poses(frame, &origins, noise_m);
-        of_frame(frame, &pose, (&origins, noise_m), &cell_of)
+        let pose = own_poses(frame, &mounts, noise_m);
+        of_frame(frame, &pose, (&mounts, noise_m), &cell_of)
     };
     let mut heights: Vec<Heights> = frames.par_iter().map(of_frame).collect();
     take_out_means(&mut heights);
@@ -42,14 +43,14 @@ pub fn heights(frames: &[FramePair], rig: &Rig, cell_of: impl Fn(&Ray, &Vector2<
 fn of_frame(
     frame: &FramePair,
     pose: &OwnPoses,
-    (origins, noise_m): (&[Point3<f64>], f64),
+    (mounts, noise_m): (&[Mount], f64),
     cell_of: &impl Fn(&Ray, &Vector2<f64>) -> Cell,
 ) -> Heights {
     let mut cells = BTreeMap::<Cell, [f64; 3]>::new();
     for ray in frame.measured.iter().filter(|r| usable(r) && r.surface == Surface::Ground) {
-        let origin = &origins[usize::from(ray.sensor)];
-        let place = ray.predicted_point(origin).coords.xy();
-        let Some(up_m) = off_surface_m(ray, origin, pose) else { continue };
+        let mount = &mounts[usize::from(ray.sensor)];
+        let place = ray.predicted_point(&mount.origin).coords.xy();
+        let Some(up_m) = off_surface_m(ray, mount, pose) else { continue };
         if (NEAR_FAR_M[0]..NEAR_FAR_M[1]).contains(&place.norm()) {
             let sums = cells.entry(cell_of(ray, &place)).or_default();
             let w = weight(ray, noise_m);

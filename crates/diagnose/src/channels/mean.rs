@@ -4,9 +4,10 @@
 //! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
 
 use crate::channels::moments::{COURSES, Moment, Moments};
+use crate::channels::own_poses::{Mount, OwnPoses, mounts, off_surface_m};
 use crate::inference::median;
 use crate::pairing::{FramePair, Ray, Surface, met_squarely};
-use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, DVector, Point3, SVector, Vector3};
 use rayon::prelude::*;
 use sensor::{Rig, Sensor};
 
@@ -56,9 +57,6 @@ pub fn columns(rig: &Rig, moments: &Moments) -> Vec<Column> {
 /// Standard deviation of the offset of a kind of surface, m.
 pub const STRUCTURE_M: f64 = 0.02;
 
-/// Distance from the surface, after the frame's own pose is subtracted, from which on a return is not of it, m.
-const STRAY_M: f64 = 0.30;
-
 /// Standard deviation of real surfaces from a plane, m.
 const RIPPLE_M: f64 = 0.006;
 
@@ -70,13 +68,6 @@ pub struct MeanFrame {
     /// X' W y.
     pub right: DVector<f64>,
 }
-
-/// Numbers of an [`OwnPoses`] for each sensor.
-pub const OWN_NUMBERS: usize = 7;
-
-/// Pose error of one frame as each sensor by itself sees it: turns about the cloud's origin, rad, and shifts, m; then
-/// the offset of all ranges, m. Without the latter a range bias is taken for a pose, another one in each scene.
-pub type OwnPoses = Vec<SVector<f64, OWN_NUMBERS>>;
 
 /// Range noise of the simulated side, m: the median over its smooth returns.
 pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
@@ -135,59 +126,8 @@ pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVecto
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
 }
 
-/// Derivatives of the distance across the surface by what [`OwnPoses`] holds of a sensor at `origin`.
-pub fn own_row(ray: &Ray, origin: &Point3<f64>) -> SVector<f64, OWN_NUMBERS> {
-    let [a, b, c, d, e, f]: [f64; 6] = pose_row(ray, origin, &Point3::origin()).into();
-    SVector::from([a, b, c, d, e, f, ray.range_lever()])
-}
-
-/// Distance of a ray's return across its surface, with its frame's own pose taken out, m; `None` where it is not of the
-/// surface. `origin` is that of its sensor.
-pub fn off_surface_m(ray: &Ray, origin: &Point3<f64>, pose: &OwnPoses) -> Option<f64> {
-    let y = ray.across_nearest_m() - own_row(ray, origin).dot(&pose[usize::from(ray.sensor)]);
-    (y.abs() <= STRAY_M).then_some(y)
-}
-
-/// Prior of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m; and of its range offset.
-fn loose_prior() -> SVector<f64, OWN_NUMBERS> {
-    SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
-}
-
-/// The pose error of one frame as each sensor sees it, fitted with redescending weights.
-pub fn own_poses(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> OwnPoses {
-    (0..origins.len()).map(|sensor| own_pose(frame, sensor, origins, noise_m)).collect()
-}
-
-fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: f64) -> SVector<f64, OWN_NUMBERS> {
-    let rows: Vec<(SVector<f64, OWN_NUMBERS>, f64, f64)> = frame
-        .measured
-        .iter()
-        .filter(|r| usable(r) && r.sensor as usize == sensor)
-        .map(|r| (own_row(r, &origins[sensor]), r.across_nearest_m(), weight(r, noise_m)))
-        .collect();
-    let mut pose = SVector::<f64, OWN_NUMBERS>::zeros();
-    for scale in [0.5, 0.3, 0.15, 0.1, 0.07, 0.07] {
-        let mut system = SMatrix::<f64, OWN_NUMBERS, OWN_NUMBERS>::from_diagonal(&loose_prior());
-        let mut right = SVector::<f64, OWN_NUMBERS>::zeros();
-        for (row, y, w) in &rows {
-            let u = (y - row.dot(&pose)) / (4.0 * scale);
-            if u.abs() < 1.0 {
-                // Errors of neighbours are correlated: a fiftieth of the weight keeps the prior meaningful.
-                let w = w * (1.0 - u * u).powi(2) / 50.0;
-                system += row * row.transpose() * w;
-                right += row * (w * y);
-            }
-        }
-        match system.try_inverse() {
-            Some(inverse) => pose = inverse * right,
-            None => return SVector::zeros(),
-        }
-    }
-    pose
-}
-
 /// Design effect: the variance of means over patches of directions, in units of that of independent residuals.
-pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[OwnPoses], noise_m: f64) -> f64 {
+pub fn design_effect(frames: &[FramePair], mounts: &[Mount], poses: &[OwnPoses], noise_m: f64) -> f64 {
     let sums: Vec<[f64; 3]> = frames
         .par_iter()
         .zip(poses)
@@ -195,7 +135,7 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
             let mut patches = std::collections::BTreeMap::<(u8, i32, i32), [f64; 3]>::new();
             for ray in frame.measured.iter().filter(|r| usable(r)) {
                 let w = weight(ray, noise_m);
-                let Some(y) = off_surface_m(ray, &origins[usize::from(ray.sensor)], pose) else { continue };
+                let Some(y) = off_surface_m(ray, &mounts[usize::from(ray.sensor)], pose) else { continue };
                 let key =
                     (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
                 let patch = patches.entry(key).or_default();
@@ -284,15 +224,15 @@ impl Compared<'_> {
         moment: &Moment,
         mut each: impl FnMut(&Ray, &[(usize, f64)], f64, f64),
     ) {
-        let origins = origins(self.rig);
+        let mounts = mounts(self.rig);
         // Most columns belong to other sensors and surfaces.
         let mut x: Vec<(usize, f64)> = Vec::with_capacity(self.columns.len());
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let sensor = ray.sensor as usize;
-            if off_surface_m(ray, &origins[sensor], pose).is_none() {
+            if off_surface_m(ray, &mounts[sensor], pose).is_none() {
                 continue;
             }
-            let levers = Levers::new(ray, &origins[sensor], &self.rig.sensors[sensor], moment);
+            let levers = Levers::new(ray, &mounts[sensor].origin, &self.rig.sensors[sensor], moment);
             x.clear();
             x.extend(self.columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
             each(ray, &x, ray.across_nearest_m(), weight(ray, self.noise_m) / self.design);
@@ -368,33 +308,6 @@ impl MeanFrame {
 mod tests {
     use super::*;
     use crate::channels::motion::OwnMotion;
-    use std::f64::consts::TAU;
-
-    /// A frame of returns whose ranges are longer by an offset: a road 2 m below the sensor, and a wall to its left.
-    fn frame(offset_m: f64, wall_m: f64) -> FramePair {
-        let return_ = |direction: Vector3<f64>| {
-            let (range_m, normal, surface) = if direction.z < -0.05 {
-                (-2.0 / direction.z, Vector3::z(), Surface::Ground)
-            } else {
-                (wall_m / direction.y, -Vector3::y(), Surface::Standing)
-            };
-            let cos_incidence = -normal.dot(&direction);
-            let met = cos_incidence > 0.05 && range_m > 0.0;
-            met.then(|| Ray {
-                surface,
-                normal: normal.cast::<f32>().into(),
-                cos_incidence: cos_incidence as f32,
-                residual_m: offset_m as f32,
-                ..Ray::standing(&(direction * range_m))
-            })
-        };
-        let shot = |k: u32| {
-            let (azimuth, elevation) = (TAU * f64::from(k % 180) / 180.0, 0.02 * f64::from(k / 180) - 0.3);
-            Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin())
-        };
-        let measured = (0..180 * 20).filter_map(|k| return_(shot(k))).collect();
-        FramePair::of_rays(String::new(), measured, vec![])
-    }
 
     /// A return of the road that is moved 1.5 m forward: range and pose change where it was recorded.
     #[test]
@@ -450,13 +363,5 @@ mod tests {
         assert!((of(Column::Lean) - 4.0 * of(Column::Pose(1))).abs() < 1e-9);
         let share = (1.0 - (-1.0f64).exp()) / (1.0 - (-2.0f64).exp());
         assert!((of(Column::Drift(1)) - share * of(Column::RangeOffset)).abs() < 1e-9);
-    }
-
-    #[test]
-    fn a_range_bias_is_no_pose_of_frames() {
-        for wall_m in [4.0, 9.0] {
-            let own = own_poses(&frame(-0.2, wall_m), &[Point3::origin()], 0.01)[0];
-            assert!(own.fixed_rows::<6>(0).norm() < 2e-3 && (own[6] + 0.2).abs() < 2e-3, "{wall_m}: {own}");
-        }
     }
 }

@@ -15,6 +15,7 @@ pub mod mean;
 pub mod mirrors;
 pub mod moments;
 pub mod motion;
+pub mod own_poses;
 pub mod patch;
 pub mod plumes;
 pub mod range_ends;

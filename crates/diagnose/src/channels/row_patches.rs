@@ -3,7 +3,8 @@
 //! left belongs to the rows.
 
 use super::groups::{Group, PARTS, Seen, part_of};
-use super::mean::{KINDS, OwnPoses, kind_of, origins, usable, weight};
+use super::mean::{KINDS, kind_of, usable, weight};
+use super::own_poses::{OwnPoses, mounts};
 use crate::inference::banded::Cholesky;
 use crate::pairing::{FramePair, Surface};
 use nalgebra::{Matrix2, Vector2};
@@ -32,6 +33,9 @@ const FEWEST: f64 = 3.0;
 /// Priors of the offsets of rows that are tried: each has half the standard deviation of the one before.
 const PRIORS: i32 = 7;
 
+/// Kind of surface that is ground: see [`kind_of`].
+const GROUND: usize = 0;
+
 /// Columns: offset of the range, m, and of the elevation, rad.
 const COLUMNS: usize = 2;
 
@@ -59,13 +63,23 @@ impl Band {
 
     /// Adds another one.
     pub fn merge(&mut self, other: &Band) {
+        self.add(other, 1.0);
+    }
+
+    /// The sums without those of a part of the returns.
+    pub fn without(mut self, part: &Band) -> Band {
+        self.add(part, -1.0);
+        self
+    }
+
+    fn add(&mut self, other: &Band, times: f64) {
         self.grow(other.right.len());
         for (row, (gram, right)) in other.gram.iter().zip(&other.right).enumerate() {
             for (a, b) in pairs() {
-                (0..WIDE).for_each(|k| self.gram[row][k][a][b] += gram[k][a][b]);
+                (0..WIDE).for_each(|k| self.gram[row][k][a][b] += times * gram[k][a][b]);
             }
-            (0..COLUMNS).for_each(|c| self.right[row][c] += right[c]);
-            self.weight[row] += other.weight[row];
+            (0..COLUMNS).for_each(|c| self.right[row][c] += times * right[c]);
+            self.weight[row] += times * other.weight[row];
         }
     }
 
@@ -162,6 +176,8 @@ fn pairs() -> impl Iterator<Item = (usize, usize)> {
 pub struct RowFrame {
     /// By sensor.
     pub sensors: Vec<[Band; PARTS]>,
+    /// The same of surfaces that stand.
+    pub standing: Vec<[Band; PARTS]>,
     /// Squares that the patches leave, in units of the assumed variance.
     pub squares: f64,
     /// Degrees of freedom of these squares.
@@ -184,7 +200,7 @@ struct Cell {
 
 /// The sums of all frames. Offsets of surfaces are integrated out.
 pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> Vec<RowFrame> {
-    let origins = origins(rig);
+    let mounts = mounts(rig);
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |(frame, poses): (&FramePair, &OwnPoses)| {
@@ -192,7 +208,7 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> 
         let mut strips = BTreeMap::<(usize, usize, i32, usize), BTreeMap<usize, Cell>>::new();
         for ray in frame.measured.iter().filter(|r| usable(r) && r.row != u16::MAX) {
             let sensor = ray.sensor as usize;
-            let Some((y, x)) = seen.across(ray, poses, &origins[sensor], &turns[sensor]) else { continue };
+            let Some((y, x)) = seen.across(ray, poses, &mounts[sensor], &turns[sensor]) else { continue };
             let part = part_of(ray, super::groups::Grouping::Row, half_fov[sensor]);
             let at = ray.direction_vector() * f64::from(ray.range_m);
             let strip = (at.y.atan2(at.x) / AZIMUTH_RAD).floor() as i32;
@@ -200,8 +216,8 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> 
             let place_m = if ray.surface == Surface::Ground { at.xy().norm() } else { at.z };
             rows.entry(usize::from(ray.row)).or_default().add(place_m, x, y, weight(ray, noise_m));
         }
-        let mut out = RowFrame { sensors: vec![Default::default(); rig.sensors.len()], ..RowFrame::default() };
-        for ((sensor, part, ..), rows) in strips {
+        let mut out = RowFrame::new(rig.sensors.len());
+        for ((sensor, part, _, kind), rows) in strips {
             let last = rows.keys().next_back().copied().unwrap_or(0);
             for from in (0..=last).step_by(STEP) {
                 // The first rows are in one patch alone otherwise.
@@ -211,7 +227,7 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> 
                     rows.range(within).filter(|(_, c)| c.n >= FEWEST).map(|(r, c)| (*r, *c)).collect();
                 let cells = even(&cells);
                 if cells.len() >= FEWEST_ROWS {
-                    add_patch(&mut out, cells, sensor, part);
+                    add_patch(&mut out, cells, (sensor, part, kind));
                 }
             }
         }
@@ -253,8 +269,18 @@ fn even(cells: &[(usize, Cell)]) -> &[(usize, Cell)] {
     runs.rev().max_by_key(|run| run.len()).unwrap_or(cells)
 }
 
+impl RowFrame {
+    fn new(sensors: usize) -> RowFrame {
+        RowFrame {
+            sensors: vec![Default::default(); sensors],
+            standing: vec![Default::default(); sensors],
+            ..RowFrame::default()
+        }
+    }
+}
+
 /// Adds a patch with its offset and slope integrated out, with half of its weight: its rows are in another one as well.
-fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part: usize) {
+fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], (sensor, part, kind): (usize, usize, usize)) {
     let middle = cells.iter().map(|(_, c)| along(c)).sum::<f64>() / cells.len() as f64;
     let place = |cell: &Cell| Vector2::new(1.0, along(cell) - middle);
     let mut own = Matrix2::zeros();
@@ -268,13 +294,26 @@ fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part:
     let of_means: f64 = cells.iter().map(|(_, c)| c.wy * c.wy / c.w).sum();
     frame.squares += 0.5 * (of_means - of_own.dot(&(inverse * of_own)));
     frame.freedom += 0.5 * (cells.len() as f64 - 2.0);
-    let band = &mut frame.sensors[sensor][part];
+    let mut bands = vec![&mut frame.sensors[sensor][part]];
+    bands.extend((kind != GROUND).then_some(&mut frame.standing[sensor][part]));
+    for band in bands {
+        add_to_band(band, cells, &inverse, &of_own, &place);
+    }
+}
+
+fn add_to_band(
+    band: &mut Band,
+    cells: &[(usize, Cell)],
+    inverse: &Matrix2<f64>,
+    of_own: &Vector2<f64>,
+    place: &dyn Fn(&Cell) -> Vector2<f64>,
+) {
     band.grow(cells.last().map_or(0, |(r, _)| r + 1));
     for (i, (row, c)) in cells.iter().enumerate() {
         band.weight[*row] += 0.5 * c.w;
         for a in 0..COLUMNS {
             let across = inverse * place(c) * c.wx[a];
-            band.right[*row][a] += 0.5 * (c.wxy[a] - across.dot(&of_own));
+            band.right[*row][a] += 0.5 * (c.wxy[a] - across.dot(of_own));
             for ((other, o), b) in cells[i..].iter().flat_map(|o| (0..COLUMNS).map(move |b| (o, b))) {
                 let same = if other == row { c.wxx[a][b] } else { 0.0 };
                 band.gram[*row][other - row][a][b] += 0.5 * (same - across.dot(&(place(o) * o.wx[b])));
@@ -285,9 +324,22 @@ fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part:
 
 /// Sums over frames and some parts of one sensor.
 pub fn total<'a>(frames: impl Iterator<Item = &'a RowFrame>, sensor: usize, parts: &dyn Fn(usize) -> bool) -> Band {
+    total_of(frames.map(|frame| &frame.sensors[..]), sensor, parts)
+}
+
+/// The same of surfaces that stand.
+pub fn standing<'a>(frames: impl Iterator<Item = &'a RowFrame>, sensor: usize, parts: &dyn Fn(usize) -> bool) -> Band {
+    total_of(frames.map(|frame| &frame.standing[..]), sensor, parts)
+}
+
+fn total_of<'a>(
+    frames: impl Iterator<Item = &'a [[Band; PARTS]]>,
+    sensor: usize,
+    parts: &dyn Fn(usize) -> bool,
+) -> Band {
     let mut sum = Band::default();
     for frame in frames {
-        let Some(of_sensor) = frame.sensors.get(sensor) else { continue };
+        let Some(of_sensor) = frame.get(sensor) else { continue };
         (0..PARTS).filter(|p| parts(*p)).for_each(|p| sum.merge(&of_sensor[p]));
     }
     sum
@@ -305,7 +357,7 @@ mod tests {
 
     /// A frame of patches with an offset and a slope each, and rows with an offset of 1 cm, in turn longer and shorter.
     fn frame(rng: &mut data::Stream, row_m: f64) -> RowFrame {
-        let mut frame = RowFrame { sensors: vec![Default::default()], ..RowFrame::default() };
+        let mut frame = RowFrame::new(1);
         let mut normal = || -> f64 { StandardNormal.sample(rng) };
         for part in 0..PARTS {
             for from in (0..24).step_by(STEP) {
@@ -321,7 +373,7 @@ mod tests {
                         (row, cell)
                     })
                     .collect();
-                add_patch(&mut frame, &cells, 0, part);
+                add_patch(&mut frame, &cells, (0, part, 1));
             }
         }
         frame

@@ -5,7 +5,8 @@ use super::hypotheses::Hypothesis;
 use super::sums::Sums;
 use crate::catalogue::Cause;
 use crate::catalogue::sizes::TURN_RAD;
-use crate::channels::mean::{Column, OwnPoses};
+use crate::channels::mean::Column;
+use crate::channels::own_poses::OwnPoses;
 use crate::search::Z_STAR;
 
 /// Turns of the other sensors agree if the smallest is at least this share of the largest.
@@ -71,7 +72,7 @@ mod tests {
             (0..24)
                 .map(|f| {
                     let own = 2e-4 * (f64::from(f * 7 % 24) / 12.0 - 1.0);
-                    let pose = |pitch: f64| SVector::from([0.0, pitch + own, 0.0, 0.0, 0.0, 0.0, 0.0]);
+                    let pose = |pitch: f64| SVector::from_fn(|k, _| if k == 1 { pitch + own } else { 0.0 });
                     vec![pose(0.002), pose(0.009), pose(of_third)]
                 })
                 .collect()

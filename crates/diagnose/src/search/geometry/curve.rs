@@ -2,8 +2,9 @@
 
 use super::Search;
 use crate::catalogue::Cause;
-use crate::channels::mean::{Column, Levers, OWN_NUMBERS, origins, own_poses, own_row, usable, usual_noise_m};
+use crate::channels::mean::{Column, Levers, usable, usual_noise_m};
 use crate::channels::moments::Moment;
+use crate::channels::own_poses::{OWN_NUMBERS, mounts, own_poses, own_row};
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
@@ -45,7 +46,7 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
     let (x, value) = axis(cause);
     let theta = |c: usize| fitted.columns.iter().position(|x| *x == c).map_or(0.0, |i| fitted.theta[i]);
     let moving: Vec<(Column, f64)> = columns.iter().map(|&c| (sums.columns[c], theta(c))).collect();
-    let origins = origins(context.rig);
+    let mounts = mounts(context.rig);
     let displaced = moving.iter().find_map(|(c, _)| if let Column::SensorPose(s, _) = c { Some(*s) } else { None });
     let noise_m = usual_noise_m(context.frames);
     let of_frame = |&f: &usize| {
@@ -54,16 +55,16 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
         // The pose error of the whole frame is that of the other sensors.
         let mut pose = SVector::zeros();
         if let Some(s) = displaced {
-            let own = own_poses(frame, &origins, noise_m);
+            let own = own_poses(frame, &mounts, noise_m);
             let others: Vec<_> = (0..own.len()).filter(|k| *k != s).map(|k| own[k]).collect();
             pose = others.iter().sum::<SVector<f64, OWN_NUMBERS>>() / others.len().max(1) as f64;
         }
         let place = |ray: &Ray| {
             let sensor = ray.sensor as usize;
             let mount = &context.rig.sensors[sensor];
-            let levers = Levers::new(ray, &origins[sensor], mount, moment);
+            let levers = Levers::new(ray, &mounts[sensor].origin, mount, moment);
             let expected: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
-            let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose);
+            let y = ray.across_nearest_m() - own_row(ray, &mounts[sensor]).dot(&pose);
             (expected != 0.0 && (y - expected).abs() < STRAY_M)
                 .then(|| [value(ray, mount, moment), y * expected.signum(), expected.abs()])
         };

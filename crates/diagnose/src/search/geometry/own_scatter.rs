@@ -1,15 +1,15 @@
 //! How much every frame may have of its own.
 
-use crate::channels::mean::{OWN, OwnPoses};
+use crate::channels::mean::OWN;
 use crate::channels::moments::Moments;
+use crate::channels::own_poses::{OwnPoses, own_slide};
 use crate::inference::median;
 use nalgebra::SVector;
 use sensor::Rig;
 
 /// Prior variances of what every frame may have of its own. Pose: the robust scatter of the frames' poses about the
 /// median of each sensor, the pitch about a line in the square of the speed where that varies. Displacement
-/// over a scan: that of a driving vehicle where a sensor scans row after row,
-/// since static surfaces are then displaced along columns, which resembles a pose error of a sensor; zero otherwise.
+/// over a scan: see [`own_slide`].
 pub(super) fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize], moments: &Moments) -> SVector<f64, OWN> {
     let least = [2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4];
     let scatter = |k: usize| {
@@ -26,9 +26,9 @@ pub(super) fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize], momen
         }
         (median(deviations) / statistics::MEDIAN_OF_NORMAL).max(least[k])
     };
-    let by_rows = rig.sensors.iter().find(|s| !s.sequential_rows().is_empty());
-    let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);
-    SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide(k - 6) }.powi(2))
+    let slides = rig.sensors.iter().map(own_slide);
+    let slide = slides.reduce(|all, of| std::array::from_fn(|k| f64::max(all[k], of[k]))).unwrap_or_default();
+    SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide[k - 6] }.powi(2))
 }
 
 /// Slope of a line through points: the median over pairs, each of a point of the lower and one of the upper half of `x`
@@ -40,9 +40,6 @@ fn median_slope(x: &[f64], y: &[f64]) -> f64 {
     let apart = lower.iter().zip(upper).filter(|(a, b)| x[**a] < x[**b]);
     median(apart.map(|(&a, &b)| (y[b] - y[a]) / (x[b] - x[a])).collect())
 }
-
-/// Standard deviations of ego motion: speed along and across the heading, m/s; yaw rate, rad/s.
-const OWN_MOTION: [f64; 3] = [40.0, 3.0, 0.3];
 
 #[cfg(test)]
 mod tests {

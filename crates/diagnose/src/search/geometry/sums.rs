@@ -8,9 +8,10 @@ use crate::channels::groups::{
     Group, GroupFrame, Grouping, PARTS, PartedFrame, Seen, Undone, group_frames, total, whole,
 };
 use crate::channels::mean::{
-    Column, Compared, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, origins, own_poses, usual_noise_m,
+    Column, Compared, KINDS, MeanFrame, OWN, STRUCTURE_M, columns, design_effect, usual_noise_m,
 };
 use crate::channels::moments::Moments;
+use crate::channels::own_poses::{OWN_AT_ONCE, OwnPoses, mounts, own_poses};
 use crate::channels::row_patches::{self, Band, Offsets, RowFrame, row_frames};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_expected, cross_gains, fit, fold_of};
@@ -49,9 +50,11 @@ pub(super) struct Sums {
     /// Variance of means of rows in patches, in units of the assumed one.
     pub(super) of_patches: f64,
     /// Sums by row, of surfaces as they are.
-    pub(super) whole_rows: Groups,
+    pub(super) whole_rows: Vec<GroupFrame>,
+    /// The same by part, of the ground and of what stands.
+    pub(super) parted_rows: [Vec<PartedFrame>; 2],
     /// The same with the pose and the offsets of surfaces that all frames share: rows may have both in common.
-    pub(super) rows_with_pose: Vec<PartedFrame>,
+    pub(super) rows_with_pose: [Vec<PartedFrame>; 2],
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
     /// Sums by step of range.
@@ -75,10 +78,10 @@ pub(super) struct Groups {
 /// columns `swept` are in the base model.
 pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, swept: &[Column]) -> Sums {
     let (frames, rig) = (context.frames, context.rig);
-    let origins = origins(rig);
+    let mounts = mounts(rig);
     let noise_m = usual_noise_m(frames);
-    let poses: Vec<OwnPoses> = frames.par_iter().map(|f| own_poses(f, &origins, noise_m)).collect();
-    let design = design_effect(frames, &origins, &poses, noise_m);
+    let poses: Vec<OwnPoses> = frames.par_iter().map(|f| own_poses(f, &mounts, noise_m)).collect();
+    let design = design_effect(frames, &mounts, &poses, noise_m);
     let moments = context.moments();
     let columns = columns(rig, &moments);
     let compared = Compared { rig, columns: &columns, noise_m, design };
@@ -99,18 +102,21 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
     let by_columns = DVector::from_iterator(columns.len(), columns.iter().map(|c| undone.of_column(*c)));
     linear.iter_mut().for_each(|frame| frame.right += &frame.gram * &by_columns);
     let seen = Seen { poses: &poses, structure, undone: &undone.rows };
-    let parted = |g, seen| group_frames(frames, rig, seen, g, noise_m, design);
+    let parted = |groups, seen| group_frames(frames, rig, seen, groups, noise_m, design);
     let groups = |g| {
-        let parted = parted(g, seen);
+        let parted = parted((g, 0..KINDS), seen);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
+    let by_row = |seen| [0..1, 1..KINDS].map(|kinds| parted((Grouping::Row, kinds), seen));
     let rows = row_frames(frames, rig, seen, noise_m);
     let with_pose = Seen { poses: &deviations(&poses, select), structure: Default::default(), ..seen };
+    let [ground, standing] = by_row(seen);
     Sums {
         of_patches: of_patches(&rows, select, rig.sensors.len()),
         rows,
-        whole_rows: groups(Grouping::Row),
-        rows_with_pose: parted(Grouping::Row, with_pose),
+        whole_rows: ground.iter().zip(&standing).map(|(g, s)| total(g.iter().chain(s)).into_iter().collect()).collect(),
+        parted_rows: [ground, standing],
+        rows_with_pose: by_row(with_pose),
         strips: groups(Grouping::Azimuth),
         steps: groups(Grouping::Range),
         columns,
@@ -129,9 +135,10 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
     }
 }
 
-/// Poses relative to the median of each sensor's over some frames.
+/// Poses relative to the median of each sensor's over some frames; displacements over a scan as they are.
 fn deviations(poses: &[OwnPoses], select: &[usize]) -> Vec<OwnPoses> {
-    let middle = |sensor: usize| SVector::from_fn(|k, _| median(select.iter().map(|&f| poses[f][sensor][k]).collect()));
+    let of = |k: usize, sensor: usize| median(select.iter().map(|&f| poses[f][sensor][k]).collect());
+    let middle = |sensor: usize| SVector::from_fn(|k, _| if k < OWN_AT_ONCE { of(k, sensor) } else { 0.0 });
     let middles: OwnPoses = (0..poses.first().map_or(0, Vec::len)).map(middle).collect();
     poses.iter().map(|of_frame| of_frame.iter().zip(&middles).map(|(pose, middle)| pose - middle).collect()).collect()
 }
@@ -266,7 +273,7 @@ impl Sums {
         columns: &[usize],
     ) -> Vec<f64> {
         if grouping != Grouping::Row {
-            let parted = &self.sums_of(grouping).parted;
+            let parted = if grouping == Grouping::Azimuth { &self.strips.parted } else { &self.steps.parted };
             return grouped::cross_part_gains(parted, select, blocks, group_fit(columns[0]), false);
         }
         let folds = fold_of(blocks);
@@ -302,21 +309,17 @@ impl Sums {
     /// Offsets of rows in one column with their variances, over some frames, fitted together with what else was chosen.
     pub(super) fn rows(&self, frames: &[usize], column: usize, chosen: &[Hypothesis]) -> BTreeMap<Group, [f64; 2]> {
         let sensors = 0..self.of_sensors.first().map_or(0, Vec::len);
-        sensors.flat_map(|sensor| row_offsets(self, frames, sensor, column, chosen)).collect()
-    }
-
-    /// Sums by group, of surfaces as they are.
-    fn sums_of(&self, grouping: Grouping) -> &Groups {
-        match grouping {
-            Grouping::Row => &self.whole_rows,
-            Grouping::Azimuth => &self.strips,
-            Grouping::Range => &self.steps,
-        }
+        let of_sensor = |sensor| std::mem::take(&mut row_offsets(self, frames, sensor, chosen)[column]);
+        sensors.flat_map(of_sensor).collect()
     }
 
     /// The groups of every frame, of surfaces as they are.
     pub(super) fn groups_of(&self, grouping: Grouping) -> &[GroupFrame] {
-        &self.sums_of(grouping).whole
+        match grouping {
+            Grouping::Row => &self.whole_rows,
+            Grouping::Azimuth => &self.strips.whole,
+            Grouping::Range => &self.steps.whole,
+        }
     }
 
     /// Fit of the base model together with the linear hypotheses.

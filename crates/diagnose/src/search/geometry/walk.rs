@@ -4,7 +4,8 @@
 use crate::catalogue::sizes::WALK_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::brightness::{BrightFrame, Brightnesses, bright_frames};
-use crate::channels::mean::{origins, own_poses, usable, usual_noise_m};
+use crate::channels::mean::{usable, usual_noise_m};
+use crate::channels::own_poses::{mounts, own_poses};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
 use crate::inference::choice::{directions_agree, total_and_z};
@@ -50,9 +51,9 @@ impl Sums {
     /// `None` where intensities do not tell surfaces apart. The variance is that of the `train` frames.
     fn new(context: &Context, train: &[usize]) -> Option<Sums> {
         let brightness = Brightnesses::of(context.frames)?;
-        let origins = origins(context.rig);
+        let mounts = mounts(context.rig);
         let noise_m = usual_noise_m(context.frames);
-        let poses: Vec<_> = context.frames.par_iter().map(|f| own_poses(f, &origins, noise_m)).collect();
+        let poses: Vec<_> = context.frames.par_iter().map(|f| own_poses(f, &mounts, noise_m)).collect();
         let frames = bright_frames(context.frames, context.rig, &poses, &brightness, noise_m);
         let [squares, freedom] =
             train.iter().fold([0.0; 2], |s, &f| [s[0] + frames[f].squares, s[1] + frames[f].freedom]);
