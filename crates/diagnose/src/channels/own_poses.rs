@@ -1,5 +1,5 @@
-//! The pose error that each frame has of its own, with its displacement over a scan: robust fits, sensor by sensor, that
-//! are taken out before returns are compared.
+//! The pose error that each frame has of its own, with its displacement over a scan: robust fits, sensor by sensor,
+//! that are taken out before returns are compared.
 
 use super::mean::{origins, pose_row, usable, weight};
 use crate::pairing::{FramePair, Ray};
