@@ -238,13 +238,10 @@ pub fn group_frames(
     let one = |(frame, poses): (&FramePair, &OwnPoses)| -> PartedFrame {
         let mut sums = vec![vec![[GroupSums::default(); PARTS]; of_sensor]; rig.sensors.len()];
         for ray in frame.measured.iter().filter(|r| usable(r)) {
-            let Some(group) = group_of(ray, grouping) else { continue };
+            let kind = super::mean::kind_of(ray);
+            let Some(group) = group_of(ray, grouping).filter(|_| kinds.contains(&kind)) else { continue };
             let sensor = ray.sensor as usize;
             let Some((y, x)) = seen.across(ray, poses, &mounts[sensor], &turns[sensor]) else { continue };
-            let kind = super::mean::kind_of(ray);
-            if !kinds.contains(&kind) {
-                continue;
-            }
             let y = y - seen.structure[kind];
             let w = weight(ray, noise_m) / design;
             sums[sensor][usize::from(group.index)][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {

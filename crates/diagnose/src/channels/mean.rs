@@ -102,10 +102,13 @@ pub fn common_bias_m(frame: &FramePair) -> f64 {
 /// Number of kinds of surfaces.
 pub const KINDS: usize = 4;
 
+/// The kind that is ground; all others stand.
+pub const GROUND: usize = 0;
+
 /// Kind of a ray's surface: ground; standing and facing right, facing left, or facing along the vehicle.
 pub fn kind_of(ray: &Ray) -> usize {
     match ray.surface {
-        Surface::Ground => 0,
+        Surface::Ground => GROUND,
         _ if ray.normal[1] < -0.3 => 1,
         _ if ray.normal[1] > 0.3 => 2,
         _ => 3,

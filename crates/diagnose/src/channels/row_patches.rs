@@ -3,7 +3,7 @@
 //! left belongs to the rows.
 
 use super::groups::{Group, PARTS, Seen, part_of};
-use super::mean::{KINDS, kind_of, usable, weight};
+use super::mean::{GROUND, KINDS, kind_of, usable, weight};
 use super::own_poses::{OwnPoses, mounts};
 use crate::inference::banded::Cholesky;
 use crate::pairing::{FramePair, Surface};
@@ -32,9 +32,6 @@ const FEWEST: f64 = 3.0;
 
 /// Priors of the offsets of rows that are tried: each has half the standard deviation of the one before.
 const PRIORS: i32 = 7;
-
-/// Kind of surface that is ground: see [`kind_of`].
-const GROUND: usize = 0;
 
 /// Columns: offset of the range, m, and of the elevation, rad.
 const COLUMNS: usize = 2;

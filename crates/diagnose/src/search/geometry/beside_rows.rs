@@ -95,8 +95,9 @@ pub(super) fn fit(search: &Search, chosen: &[Hypothesis]) -> Option<BesideRows> 
     let of_frame = |&f: &usize| row_sums(search, &paired, f, &places, &linear);
     let frames: Vec<RowSums> = search.estimate.par_iter().map(of_frame).collect();
     let total = total(search, &frames, &linear);
+    let all = sums.rows(&search.estimate, chosen);
     let spread = |column: usize| {
-        let (std, _) = spread_of(column, &sums.rows(&search.estimate, column, chosen));
+        let (std, _) = spread_of(column, &all[column]);
         std.clamp(1e-9, group_fit(column).precision.sqrt().recip())
     };
     let solved = Solved::new(&total, &places, &places.columns.iter().map(|&c| (c, spread(c))).collect())?;
@@ -115,7 +116,7 @@ pub(super) fn fit(search: &Search, chosen: &[Hypothesis]) -> Option<BesideRows> 
 
 /// Spread of the offsets of rows, with the number of those that are known well; the offsets with their variances.
 pub(super) fn rows(search: &Search, column: usize, chosen: &[Hypothesis]) -> ((f64, f64), BTreeMap<Group, [f64; 2]>) {
-    let mut rows = search.sums.rows(&search.estimate, column, chosen);
+    let mut rows = std::mem::take(&mut search.sums.rows(&search.estimate, chosen)[column]);
     let spread = spread_of(column, &rows);
     if let Some(fit) = search.reported.as_ref().and_then(|reported| reported.rows.as_ref()) {
         let without = search.sums.fit_all(&search.estimate, &search.estimate_blocks, chosen);

@@ -117,20 +117,16 @@ pub(super) fn row_offsets(sums: &Sums, frames: &[usize], sensor: usize, chosen: 
     let of = |column: usize, surfaces: Surfaces| {
         OfSensor::new(sums, frames, sensor, (column, surfaces), column == 1 && turned_by_rows)
     };
+    let mut rows = [BTreeMap::new(), BTreeMap::new()];
     match row_columns(chosen)[..] {
-        [] => Default::default(),
-        [column] => {
-            let rows = alone(&of(column, Surfaces::All).measured(), column);
-            let mut out: [Rows; 2] = Default::default();
-            out[column] = rows.into_iter().map(|(row, of)| (row_patches::group(sensor, row), of)).collect();
-            out
-        }
+        [] => {}
+        [column] => rows[column] = alone(&of(column, Surfaces::All).measured(), column),
         _ => {
             let ground = of(1, Surfaces::Ground);
-            together(&of(0, Surfaces::Standing).measured(), &ground.measured(), &ground.ranges_as_elevations())
-                .map(|rows| rows.into_iter().map(|(row, of)| (row_patches::group(sensor, row), of)).collect())
+            rows = together(&of(0, Surfaces::Standing).measured(), &ground.measured(), &ground.ranges_as_elevations());
         }
     }
+    rows.map(|rows| rows.into_iter().map(|(row, of)| (row_patches::group(sensor, row), of)).collect())
 }
 
 /// The surfaces that rows are measured on.

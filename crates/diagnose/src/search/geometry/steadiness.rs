@@ -4,18 +4,15 @@
 use super::Search;
 use super::floor::FLOOR_GROUPS;
 use super::hypotheses::Hypothesis;
+use super::row_offsets::Rows;
 use crate::channels::groups::Group;
 use crate::inference::grouped::spread_of_rows;
-use std::collections::BTreeMap;
 
 /// Course of the changes that are looked for: the middle one of `Moment::course`.
 const COURSE: usize = 1;
 
 /// Change of the offsets over the recording, as a share of their mean over it, from which on they are not steady.
 const LEAST_SHARE: f64 = 0.5;
-
-/// Offsets of rows with their variances.
-type Rows = BTreeMap<Group, [f64; 2]>;
 
 /// Whether the offsets of rows in range (column 0) or in elevation (column 1) come with time: they change over the
 /// recording, by more than a small part of their mean, and those at its beginning are not seen. Not known without
@@ -29,7 +26,7 @@ pub(super) fn come_with_time(search: &Search, column: usize, chosen: &[Hypothesi
     let (early, late) = frames.split_at(frames.len() / 2);
     let moments = &search.sums.moments.of_frames;
     let at = |half: &[usize]| half.iter().map(|&f| moments[f].course(COURSE)).sum::<f64>() / half.len().max(1) as f64;
-    let rows = |half: &[usize]| search.sums.rows(half, column, chosen);
+    let rows = |half: &[usize]| std::mem::take(&mut search.sums.rows(half, chosen)[column]);
     let [beginning, change, mean] = parts([&rows(early), &rows(late)], [at(early), at(late)]);
     let [beginning, change, mean] = [beginning, change, mean].map(|rows| spread_of_rows(&rows).0);
     let least = FLOOR_GROUPS[column];

@@ -3,12 +3,12 @@
 use super::displacement::Displacement;
 use super::hypotheses::Hypothesis;
 use super::own_scatter::own_scatter;
-use super::row_offsets::row_offsets;
+use super::row_offsets::{Rows, row_offsets};
 use crate::channels::groups::{
     Group, GroupFrame, Grouping, PARTS, PartedFrame, Seen, Undone, group_frames, total, whole,
 };
 use crate::channels::mean::{
-    Column, Compared, KINDS, MeanFrame, OWN, STRUCTURE_M, columns, design_effect, usual_noise_m,
+    Column, Compared, GROUND, KINDS, MeanFrame, OWN, STRUCTURE_M, columns, design_effect, usual_noise_m,
 };
 use crate::channels::moments::Moments;
 use crate::channels::own_poses::{OWN_AT_ONCE, OwnPoses, mounts, own_poses};
@@ -107,7 +107,7 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
         let parted = parted((g, 0..KINDS), seen);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
-    let by_row = |seen| [0..1, 1..KINDS].map(|kinds| parted((Grouping::Row, kinds), seen));
+    let by_row = |seen| [GROUND..GROUND + 1, GROUND + 1..KINDS].map(|kinds| parted((Grouping::Row, kinds), seen));
     let rows = row_frames(frames, rig, seen, noise_m);
     let with_pose = Seen { poses: &deviations(&poses, select), structure: Default::default(), ..seen };
     let [ground, standing] = by_row(seen);
@@ -303,14 +303,18 @@ impl Sums {
         if grouping != Grouping::Row {
             return grouped::offsets(&total(frames.iter().map(|&i| &self.groups_of(grouping)[i])), how);
         }
-        self.rows(frames, how.column, chosen).into_iter().map(|(row, [offset, _])| (row, offset)).collect()
+        self.rows(frames, chosen)[how.column].iter().map(|(row, [offset, _])| (*row, *offset)).collect()
     }
 
-    /// Offsets of rows in one column with their variances, over some frames, fitted together with what else was chosen.
-    pub(super) fn rows(&self, frames: &[usize], column: usize, chosen: &[Hypothesis]) -> BTreeMap<Group, [f64; 2]> {
-        let sensors = 0..self.of_sensors.first().map_or(0, Vec::len);
-        let of_sensor = |sensor| std::mem::take(&mut row_offsets(self, frames, sensor, chosen)[column]);
-        sensors.flat_map(of_sensor).collect()
+    /// Offsets of rows in each of the chosen columns with their variances, over some frames, fitted together with what
+    /// else was chosen.
+    pub(super) fn rows(&self, frames: &[usize], chosen: &[Hypothesis]) -> [Rows; 2] {
+        let mut out: [Rows; 2] = Default::default();
+        for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
+            let of_sensor = row_offsets(self, frames, sensor, chosen);
+            out.iter_mut().zip(of_sensor).for_each(|(all, of)| all.extend(of));
+        }
+        out
     }
 
     /// The groups of every frame, of surfaces as they are.
@@ -367,15 +371,11 @@ impl Sums {
 
     /// Gains of frames by the offsets of rows among the chosen hypotheses, fitted together, nats.
     fn gains_of_rows(&self, estimate: &[usize], frames: &[usize], chosen: &[Hypothesis]) -> Vec<f64> {
-        let offsets = |c: usize| (c, self.offsets(estimate, Grouping::Row, group_fit(c), chosen));
-        let fits: Vec<(usize, BTreeMap<Group, f64>)> = row_columns(chosen).into_iter().map(offsets).collect();
+        let fitted = self.rows(estimate, chosen);
         let of_sensor = |(sensor, parts): (usize, &[Band; PARTS])| -> f64 {
             let rows = parts.iter().map(Band::rows).max().unwrap_or(0);
-            let mut of_rows: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
-            for (column, offsets) in &fits {
-                let of = |row| offsets.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
-                of_rows[*column] = (0..rows).map(of).collect();
-            }
+            let of = |column: usize, row| fitted[column].get(&row_patches::group(sensor, row)).map_or(0.0, |[o, _]| *o);
+            let of_rows: Offsets = std::array::from_fn(|column| (0..rows).map(|row| of(column, row)).collect());
             parts.iter().map(|band| band.gain(&of_rows)).sum()
         };
         let of_frame = |&f: &usize| self.rows[f].sensors.iter().enumerate().map(of_sensor).sum::<f64>();
