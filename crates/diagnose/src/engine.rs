@@ -4,12 +4,15 @@ mod baked_in;
 mod curves;
 mod known;
 mod lacking;
+mod measured_gain;
 mod notes;
 mod places;
+mod progress;
 mod reached;
 mod report;
 mod verification;
 
+pub use progress::{Progress, Stage};
 pub(crate) use reached::set_reached;
 pub(crate) use report::{refused, report};
 pub use verification::{Discrepancy, OnClouds, RemadeFrames, Remake, SEEDS, Switch, View, ViewState};
@@ -17,10 +20,11 @@ pub(crate) use verification::{Distances, GainFrames, of_channels};
 
 use self::known::Known;
 use self::lacking::add_what_is_lacking;
+use self::measured_gain::with_gain;
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
 use self::places::places_of;
 use self::report::corrected;
-use self::verification::{Verification, measure_gain};
+use self::verification::Verification;
 use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::motion;
@@ -57,22 +61,6 @@ pub struct Options {
     /// Causes that are in both sides, as the simulated one was made of the measured one.
     pub baked_in: Vec<Unidentifiable>,
 }
-
-/// Stages, for the display of progress.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
-    /// Estimating scan patterns and comparing scenes.
-    Comparing,
-    /// Pairing frames.
-    Pairing,
-    /// Comparing hypotheses.
-    Weighing,
-    /// Making frames anew with what was found.
-    Verifying,
-}
-
-/// Called with the stage, how much of it is finished and how much there is.
-pub type Progress<'a> = &'a (dyn Fn(Stage, usize, usize) + Sync);
 
 /// A diagnosis with what follows from it.
 #[derive(Clone, Debug)]
@@ -295,6 +283,7 @@ impl Engine<'_> {
         let standing = if changed { known.standing(self, standing)? } else { standing };
         let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
         let mut results = vec![sliding, rounding, of_coordinates, dual, by_brightness, result];
+        notes.extend(displaced.note_of_frames());
         known.displaced = displaced;
         self.finished(3);
         results.extend(self.single_returns(&context, &known, &mut notes)?);
@@ -311,15 +300,13 @@ impl Engine<'_> {
         baked_in::take_names(&mut diagnosis, self.baked_in);
         add_what_is_lacking(&mut diagnosis, rows_deg.iter().any(|rows| !rows.is_empty()));
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
-        let made_from = if let Extension::Found(made_from) = extension { Some(made_from) } else { None };
-        let extended = extended_toml(&diagnosis, made_from);
         (self.progress)(Stage::Verifying, 0, 1);
         let found = diagnosis.findings.iter().map(|f| f.channel).collect();
         let verification = Verification::new(self, &recorded, found, places_of(&diagnosis.findings, context.rig));
-        let mut view = None;
+        let (mut extended, mut view) = (String::new(), None);
         match extension {
             Extension::Given(effects) => diagnosis.gain = verification.of(effects, &remake.with(effects)?)?.gain,
-            Extension::Found(_) => view = measure_gain(&mut diagnosis, &verification, &extended, remake)?,
+            Extension::Found(from) => (extended, view) = with_gain(&mut diagnosis, &verification, from, remake)?,
         }
         (self.progress)(Stage::Verifying, 1, 1);
         Ok(Outcome { diagnosis, corrected, extended, view })

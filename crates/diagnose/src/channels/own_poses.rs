@@ -62,17 +62,22 @@ pub fn off_surface_m(ray: &Ray, mount: &Mount, pose: &OwnPoses) -> Option<f64> {
 }
 
 /// Prior standard deviations of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m; and of its range offset.
-const LOOSE: [f64; OWN_AT_ONCE] = [0.035, 0.035, 0.035, 0.5, 0.5, 0.5, 0.5];
+pub const LOOSE: [f64; OWN_AT_ONCE] = [0.035, 0.035, 0.035, 0.5, 0.5, 0.5, 0.5];
 
 /// The pose error of one frame as each sensor sees it, fitted with redescending weights.
 pub fn own_poses(frame: &FramePair, mounts: &[Mount], noise_m: f64) -> OwnPoses {
+    own_poses_within(frame, mounts, noise_m, &LOOSE)
+}
+
+/// The same with other prior standard deviations of the numbers but the displacement over a scan.
+pub fn own_poses_within(frame: &FramePair, mounts: &[Mount], noise_m: f64, within: &[f64; OWN_AT_ONCE]) -> OwnPoses {
     let of_sensor = |(sensor, mount): (usize, &Mount)| {
         let Some(by_rows) = mount.by_rows else {
-            let pose = own_pose::<OWN_AT_ONCE>(frame, (sensor, mount), &LOOSE, noise_m);
+            let pose = own_pose::<OWN_AT_ONCE>(frame, (sensor, mount), within, noise_m);
             return SVector::from_fn(|k, _| if k < OWN_AT_ONCE { pose[k] } else { 0.0 });
         };
         let slide = own_slide(by_rows);
-        let prior = std::array::from_fn(|k| if k < OWN_AT_ONCE { LOOSE[k] } else { slide[k - OWN_AT_ONCE] });
+        let prior = std::array::from_fn(|k| if k < OWN_AT_ONCE { within[k] } else { slide[k - OWN_AT_ONCE] });
         own_pose::<OWN_NUMBERS>(frame, (sensor, mount), &prior, noise_m)
     };
     mounts.iter().enumerate().map(of_sensor).collect()

@@ -8,9 +8,9 @@ use rayon::prelude::*;
 use statistics::{blocks_of, deviation, draw_blocks};
 use std::collections::BTreeMap;
 
-/// One of so many measured returns may lie beyond the largest range: false alarms. The second value is for scenes
-/// with few returns near it.
-const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
+/// Largest share of the simulated returns beyond an end that the measured side has there: false alarms occur at all
+/// ranges.
+const BEYOND: f64 = 0.05;
 
 /// Least share of the returns that other losses leave inside of a step: where fewer are left, a law of losses ends
 /// there.
@@ -80,20 +80,20 @@ fn cut(frames: &[FramePair], which: &[usize], end: End) -> Option<RangeEnd> {
         return None;
     }
     let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
-    OUTLIER_ONE_IN.into_iter().find_map(|one_in| {
-        let farthest = a[a.len() - 1 - a.len() / one_in];
-        let at = change(&a, &b, 0.8 * farthest);
-        let lost = above(&b, 1.01 * at);
-        let beyond = above(&a, 1.01 * at) / lost.max(1.0);
-        let before = above(&b, 0.9 * at) - above(&b, 0.995 * at);
-        if lost < 60.0 || lost < CUT_SHARE * b.len() as f64 || beyond > 0.05 || before < 40.0 {
-            return None;
-        }
-        let end_m = value(at);
-        let step = SoftStep::fit(&sum_of(counts_about(frames, which, end_m).iter().flatten()), end);
-        let found = RangeEnd { at_m: end_m * (1.0 + step.middle), width: step.width };
-        (step.width < WIDEST && step.usual > LEAST_USUAL).then_some(found)
-    })
+    // The outermost place beyond which the measured side has next to nothing of what the simulation has.
+    let empty = |i: &usize| (a.len() - 1 - i) as f64 <= BEYOND * above(&b, a[*i]);
+    let outermost = a[(0..a.len()).find(empty)?];
+    let at = change(&a, &b, 0.8 * outermost);
+    let lost = above(&b, 1.01 * at);
+    let beyond = above(&a, 1.01 * at) / lost.max(1.0);
+    let before = above(&b, 0.9 * at) - above(&b, 0.995 * at);
+    if lost < 60.0 || lost < CUT_SHARE * b.len() as f64 || beyond > BEYOND || before < 40.0 {
+        return None;
+    }
+    let end_m = value(at);
+    let step = SoftStep::fit(&sum_of(counts_about(frames, which, end_m).iter().flatten()), end);
+    let found = RangeEnd { at_m: end_m * (1.0 + step.middle), width: step.width };
+    (step.width < WIDEST && step.usual > LEAST_USUAL).then_some(found)
 }
 
 /// The most likely single step of the share of measured returns among all, beyond `from_m`, m.
@@ -320,6 +320,21 @@ mod tests {
         let [[same_m, alike], [middle_m, error]] = [of(0.0), of(0.1)];
         assert!((same_m - 6.0).abs() < 0.01 && alike < 0.01, "{same_m} {alike}");
         assert!((middle_m - 6.05).abs() < 2.0 * error && (0.01..0.05).contains(&error), "{middle_m} {error}");
+    }
+
+    #[test]
+    fn a_few_returns_beyond_an_end_do_not_hide_it() {
+        let ray = |range_m: f64, matched: bool| Ray { matched, ..Ray::standing(&Vector3::new(range_m, 0.0, 0.0)) };
+        let simulated = || (0..6000).map(|k| 3.0 + 0.005 * f64::from(k));
+        // One in a hundred of the nearer ones is a false alarm.
+        let measured = simulated().filter(|r| *r > 8.0).chain((0..10).map(|k| 5.4 + 0.01 * f64::from(k)));
+        let frame = FramePair::of_rays(
+            String::new(),
+            measured.map(|r| ray(r, true)).collect(),
+            simulated().map(|r| ray(r, r > 8.0)).collect(),
+        );
+        let near = near_cut(&[frame], &[0]).unwrap();
+        assert!((near.at_m - 8.0).abs() < 0.02, "{near:?}");
     }
 
     #[test]

@@ -5,6 +5,7 @@ use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied,
 use crate::effects::cause_of;
 use crate::extended::why_none;
 use crate::search::Z_STAR;
+use sensor::Effect;
 use std::collections::BTreeMap;
 
 /// Difference of what was promised and what was reached from which on the form of a cause does not fit.
@@ -44,8 +45,7 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, places: &BTreeMap<usize, Re
         let promised = parts.map_or(promised, |parts| promised_at_least(promised, parts));
         // What is lost in its own directions is what it was found by.
         let promised = if place.is_some() { promised.max(MOST) } else { promised };
-        let applied = !finding.effects.is_empty()
-            && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
+        let applied = is_applied(finding, gain);
         // What the extended simulation makes no better is not what is wrong, if it promised to be much of it.
         let no_better = measured.closed <= 0.0 && promised > MUCH;
         let surely_less = no_better || measured.ci95.is_some_and(|[_, high]| high < promised - FORM);
@@ -74,6 +74,34 @@ pub(super) fn closed_of<'a>(gain: &'a Gain, place: Option<&'a Reached>, finding:
         (None, Some(kind)) => gain.closed_by_kind.get(&kind),
         (None, None) => gain.closed_by_channel.get(&finding.channel),
     }
+}
+
+/// What recording tells a cause that makes a difference where there was none.
+const TELL_BY: &str = "recordings whose poses are known better, so that both sides see the same surfaces";
+
+/// Takes back the findings with which the extended simulation differs from the measured side by more than `least` nats
+/// a return in what they are about, where the simulation does not differ from it: they are no gain on any other frame.
+/// Says whether there were any.
+pub(crate) fn take_back_differences(diagnosis: &mut Diagnosis, least: f64) -> bool {
+    let Diagnosis { findings, gain, .. } = diagnosis;
+    let mut taken = false;
+    for finding in findings.iter_mut().filter(|f| f.reached.is_none() && is_applied(f, gain)) {
+        let of_kind = kind_of(finding).and_then(|kind| gain.kinds.get(&kind));
+        let part = of_kind.or_else(|| gain.channels.get(&finding.channel));
+        let Some([before, after, floor]) = part.copied() else { continue };
+        if before - floor < least && after - before.max(floor) > least {
+            let why = ": in held-out frames the two sides do not differ by it, and the extended simulation would";
+            finding.becomes_not_identifiable(why, TELL_BY);
+            taken = true;
+        }
+    }
+    taken
+}
+
+/// Whether all effects of a finding were applied.
+fn is_applied(finding: &Finding, gain: &Gain) -> bool {
+    let left_out = |e: &Effect| gain.not_applied.iter().any(|left| left.effect == e.kind());
+    !finding.effects.is_empty() && !finding.effects.iter().any(left_out)
 }
 
 /// Takes the name of a finding's cause back.
@@ -109,6 +137,10 @@ fn promised_at_least(of_channel: f64, [kind, channel]: [[f64; 3]; 2]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::catalogue::Covariate;
+    use crate::curve::Curve;
+    use crate::diagnosis::{FindingGain, SCHEMA};
+    use sensor::effects::RangeNoise;
 
     #[test]
     fn what_fits_leave_of_a_channel_may_all_be_of_one_kind() {
@@ -119,5 +151,53 @@ mod tests {
         assert!((at_least([1.1, 0.1, 0.0]) - 0.98).abs() < 1e-9, "other kinds are better than the simulation");
         assert!(at_least([0.01, 0.0, 0.0]) < 0.0, "nothing is promised of so little");
         assert!((at_least([0.1, 0.0, 0.2]) - 0.98).abs() < 1e-9);
+    }
+
+    /// Range noise that was applied, with distances of roughness before, after and at the floor.
+    fn noise_with(distances: [f64; 3]) -> Diagnosis {
+        let finding = Finding {
+            status: Status::Named,
+            cause: Some(Cause::RangeNoise),
+            candidates: None,
+            family: Cause::RangeNoise.family(),
+            parameters: BTreeMap::new(),
+            confidence: 1.0,
+            channel: Channel::Roughness,
+            covariate: Covariate::Range,
+            gain: FindingGain::default(),
+            predicted: None,
+            reached: None,
+            says: "ranges scatter more".into(),
+            separate_by: None,
+            curve: Curve::default(),
+            effects: vec![Effect::RangeNoise(RangeNoise::default())],
+        };
+        Diagnosis {
+            schema: SCHEMA.into(),
+            build: String::new(),
+            verdict: Verdict::Explained,
+            frames: Default::default(),
+            findings: vec![finding],
+            minimum_detectable: Default::default(),
+            gain: Gain { channels: [(Channel::Roughness, distances)].into(), ..Gain::default() },
+            detectors: vec![],
+            not_identifiable: vec![],
+            considered: vec![],
+            notes: vec![],
+        }
+    }
+
+    #[test]
+    fn what_makes_a_difference_where_none_was_is_taken_back() {
+        let status_after = |distances: [f64; 3]| {
+            let mut diagnosis = noise_with(distances);
+            let taken = take_back_differences(&mut diagnosis, 1e-4);
+            assert_eq!(taken, diagnosis.findings[0].effects.is_empty());
+            diagnosis.findings[0].status
+        };
+        assert_eq!(status_after([1e-5, 3e-3, 0.0]), Status::NotIdentifiable);
+        assert_eq!(status_after([4e-3, 1e-3, 0.0]), Status::Named, "it is nearer than before");
+        assert_eq!(status_after([1e-5, 5e-5, 0.0]), Status::Named, "neither before nor after");
+        assert_eq!(status_after([1e-5, 3e-3, 3e-3]), Status::Named, "two draws differ as much");
     }
 }

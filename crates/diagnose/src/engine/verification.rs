@@ -9,12 +9,12 @@ mod view;
 
 pub use view::{Discrepancy, Switch, View, ViewState};
 
-use super::reached::{Reached, closed_of, set_reached};
+use super::reached::{Reached, closed_of};
 use super::report::METRIC;
 use super::{Engine, curves};
 use crate::catalogue::{Channel, Kind};
 use crate::channels::mask::DirectionCell;
-use crate::diagnosis::{Closed, Diagnosis, Finding, Gain, NotApplied};
+use crate::diagnosis::{Closed, Finding, Gain, NotApplied};
 use crate::error::DiagnoseError;
 use crate::inference::evenly_spread;
 use crate::inference::roles::Role;
@@ -31,7 +31,6 @@ use sensor::finished::{FinishedDataset, Refusal};
 use sensor::{EffectList, Rig};
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::sync::Arc;
 
 /// Frames of a role that are made anew, at most.
@@ -171,7 +170,7 @@ fn distances(
 pub(super) struct Extended {
     pub(super) gain: Gain,
     /// What is gone in the directions of findings, by their number.
-    places: BTreeMap<usize, Reached>,
+    pub(super) places: BTreeMap<usize, Reached>,
     frames: Vec<FramePair>,
 }
 
@@ -239,6 +238,11 @@ impl<'a> Verification<'a> {
         let of_place = |&number: &usize| Some((number, self.frames().reached(three, Part::Place(number))?));
         let places = self.places.keys().filter_map(of_place).collect();
         Ok(Extended { gain: Gain { not_applied, ..self.gain(&after, &floor, true) }, places, frames })
+    }
+
+    /// Least distance that counts, nats a simulated return.
+    pub(super) fn least(&self) -> f64 {
+        ENOUGH_NATS / self.frames().returns.max(1.0)
     }
 
     /// The frames that are made anew, in order.
@@ -372,28 +376,4 @@ impl GainFrames {
             ..Gain::default()
         }
     }
-}
-
-/// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded. Returns a
-/// view of it in one frame.
-pub(super) fn measure_gain(
-    diagnosis: &mut Diagnosis,
-    verification: &Verification,
-    extended: &str,
-    remake: &dyn Remake,
-) -> Result<Option<View>, DiagnoseError> {
-    let (gain, places, view) = match diagnosis.findings.is_empty() {
-        true => (verification.without_extension(), BTreeMap::new(), None),
-        false => {
-            let effects = EffectList::parse(extended, Path::new("extended.toml"))?;
-            let prepared = remake.with(&effects)?;
-            let extended = verification.of(&effects, &prepared)?;
-            verification.measure_curves(&mut diagnosis.findings, &extended);
-            let view = verification.view(&effects, &diagnosis.findings, &prepared)?;
-            (extended.gain, extended.places, view)
-        }
-    };
-    diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    set_reached(diagnosis, &places);
-    Ok(view)
 }

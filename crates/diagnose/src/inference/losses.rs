@@ -265,14 +265,9 @@ impl LossTable {
         self.used.iter().map(|&i| self.cells[i].simulated.n * of(i)).sum::<f64>() / n.max(1.0)
     }
 
-    /// Share of simulated returns that the laws lose.
-    pub fn lost(&self, laws: &[FittedLaw]) -> f64 {
-        self.mean(|i| 1.0 - self.kept(laws, i))
-    }
-
-    /// Mean absolute difference of the shares that some laws and others keep, over simulated returns.
+    /// Root mean square difference of the shares that some laws and others keep, over simulated returns.
     pub fn changed(&self, laws: &[FittedLaw], others: &[FittedLaw]) -> f64 {
-        self.mean(|i| (self.kept(laws, i) - self.kept(others, i)).abs())
+        self.mean(|i| (self.kept(laws, i) - self.kept(others, i)).powi(2)).sqrt()
     }
 
     /// Share of the returns of a kind of surface that the laws would lose more if all cosines of incidence are equally
@@ -460,6 +455,18 @@ mod tests {
             [0.2, 0.105573].map(|a| FittedLaw { law: Law::Random, numbers: [a, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] });
         assert!(table.changed(&[half, half], &[alone]) < 1e-4);
         assert!((table.changed(&[alone, half], &[alone]) - 0.8 * 0.105573).abs() < 1e-6);
+    }
+
+    #[test]
+    fn what_takes_much_of_a_few_returns_changes_more_than_as_many_lost_anywhere() {
+        let table = table(|_, _, _| 1.0);
+        let law =
+            |law, numbers: [f64; 2]| FittedLaw { law, numbers: [numbers[0], numbers[1], 0.0, 0.0, 0.0, 0.0, 0.0] };
+        let far = law(Law::Range, [80f64.ln(), 3.0]);
+        let lost = table.mean(|i| 1.0 - table.kept(&[far], i));
+        let anywhere = law(Law::Random, [lost, 0.0]);
+        assert!((table.changed(&[anywhere], &[]) - lost).abs() < 1e-9);
+        assert!(lost > 1e-3 && table.changed(&[far], &[]) > 2.0 * lost, "{lost} {}", table.changed(&[far], &[]));
     }
 
     #[test]

@@ -122,8 +122,8 @@ impl<'a> Search<'a> {
             }
             Law::Random => own.min(most(None)) > LOST_SHARE + 0.02 * joins + 0.01 * self.displaced,
             _ => {
-                let lost = (table.lost(laws) - table.lost(before)).abs();
-                lost.min(table.changed(laws, alone)) > LOST_SHARE + 0.005 * joins + 0.01 * self.displaced
+                let least = LOST_SHARE + 0.005 * joins + 0.01 * self.displaced;
+                table.changed(laws, before).min(table.changed(laws, alone)) > least
             }
         }
     }

@@ -253,6 +253,7 @@ impl Search<'_> {
         let outcome = match &evidence {
             e if !e.significant => "no more of them than on the simulated side",
             e if e.more <= e.floor => "too small to speak of",
+            e if self.excess(&self.estimate, kind)[1] <= e.floor => "too small to speak of in other frames",
             e if !e.one_sided => "as many are missing elsewhere: surfaces stand elsewhere, nothing was added",
             _ => "chosen",
         };

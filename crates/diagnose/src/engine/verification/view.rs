@@ -101,7 +101,7 @@ impl Verification<'_> {
     ///
     /// # Errors
     /// Files that cannot be read, and frames that cannot be made.
-    pub(super) fn view(
+    pub(in crate::engine) fn view(
         &self,
         effects: &EffectList,
         findings: &[Finding],

@@ -20,6 +20,9 @@ pub struct Displacement {
     pub scene: SVector<f64, 6>,
     /// The same for what single sensors see, about their own origins.
     pub sensors: Vec<SVector<f64, 6>>,
+    /// The same for single frames, as each sensor sees them, about the origin of the cloud; empty where frames lie as
+    /// all do. See [`wandering`](super::wandering::wandering).
+    pub frames: Vec<Vec<SVector<f64, 6>>>,
     /// Constant range offset, m, and relative range error.
     pub bias: [f64; 2],
     /// Range offsets that grow over the recording, m at its end: see [`Moment::course`].
@@ -52,7 +55,28 @@ pub enum Swept {
 impl Displacement {
     /// Whether the scene as a whole is turned or shifted.
     pub fn moves(&self) -> bool {
-        self.lean_rad != 0.0 || self.scene.norm() > 0.0 || self.sensors.iter().any(|s| s.norm() > 0.0)
+        self.lean_rad != 0.0
+            || !self.frames.is_empty()
+            || self.scene.norm() > 0.0
+            || self.sensors.iter().any(|s| s.norm() > 0.0)
+    }
+
+    /// A note about frames that lie elsewhere than the others.
+    pub fn note_of_frames(&self) -> Option<String> {
+        let poses = || self.frames.iter().flatten();
+        let rms = |of: fn(&SVector<f64, 6>) -> f64| {
+            let squares: Vec<f64> = poses().map(|pose| of(pose).powi(2)).collect();
+            (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
+        };
+        let [turn_deg, shift_m] =
+            [rms(|p| p.fixed_rows::<3>(0).norm()).to_degrees(), rms(|p| p.fixed_rows::<3>(3).norm())];
+        (!self.frames.is_empty()).then(|| {
+            format!(
+                "the measured frames are turned by {turn_deg:.2} degrees and shifted by {:.0} cm (root mean square) \
+                 against the simulated ones, each by another pose error; other differences are searched with these undone",
+                100.0 * shift_m
+            )
+        })
     }
 
     /// Whether rows have elevation offsets.
@@ -111,6 +135,9 @@ impl Displacement {
         let mut scene = self.scene;
         scene[1] += self.lean_rad * moment.lean();
         let bias_m = self.bias[0] + self.bias[1] * to.norm() + drift_m;
+        if let Some(of_frame) = self.frames.get(frame).and_then(|sensors| sensors.get(sensor)) {
+            scene += of_frame;
+        }
         turned(&scene, Vector3::zeros()) + own + to.normalize() * bias_m
     }
 
@@ -214,5 +241,20 @@ mod tests {
         assert!((undone - shot(-0.08, 20.0)).norm() < 1e-9, "{undone}");
         let other = shot(0.0, 20.0);
         assert_eq!(displaced.of_row(&other, 0, &sensors, &pose), Vector3::zeros());
+    }
+
+    #[test]
+    fn a_frame_has_its_own_pose_beside_that_of_all() {
+        let shift = |by: f64| SVector::from([0.0, 0.0, 0.0, by, 0.0, 0.0]);
+        let turn = SVector::from([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]);
+        let frames = vec![vec![shift(0.2)], vec![turn]];
+        let displaced = Displacement { scene: shift(0.1), frames, ..Displacement::default() };
+        let of = |frame: usize| displaced.of_point(&Vector3::new(20.0, 0.0, 0.0), (frame, 0), &Point3::origin());
+        assert!((of(0) - Vector3::new(0.3, 0.0, 0.0)).norm() < 1e-12);
+        assert!((of(1) - Vector3::new(0.1, 0.2, 0.0)).norm() < 1e-12);
+        assert!(
+            displaced.moves() && displaced.note_of_frames().unwrap().contains("by 0.41 degrees and shifted by 14 cm")
+        );
+        assert_eq!(Displacement { frames: vec![], ..displaced }.note_of_frames(), None);
     }
 }

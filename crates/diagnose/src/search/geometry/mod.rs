@@ -19,6 +19,7 @@ mod steadiness;
 mod sums;
 pub mod vibration;
 pub mod walk;
+mod wandering;
 
 pub use self::displacement::{Displacement, Swept};
 
@@ -28,6 +29,7 @@ use self::floor::above_floor;
 use self::hypotheses::Hypothesis;
 use self::reported::Reported;
 use self::sums::{Sums, sums};
+use self::wandering::wandering;
 use super::confounders::is_confirmed;
 use super::rolling_shutter::Slide;
 use super::{ChannelResult, Context, Selected, Z_STAR, first_demands};
@@ -150,7 +152,9 @@ pub fn search(context: &Context, slide: Option<&Slide>, undo: Undo) -> Result<Ge
     for ((hypothesis, selected), gains) in chosen.iter().zip(selected).zip(gains) {
         result.found.push(describe::found(&search, hypothesis, &chosen, selected, gains));
     }
-    let (displaced, swept) = (search.displacement(&chosen), search.what_is_swept(&chosen));
+    let (mut displaced, swept) = (search.displacement(&chosen), search.what_is_swept(&chosen));
+    let Search { sums, .. } = &search;
+    displaced.frames = wandering(search.paired().frames, context.rig, &sums.own_prior, sums.noise_m);
     if let Some(Sheared { hypothesis, selected, gains }) = sheared {
         result.distance.iter_mut().zip(&gains).for_each(|(d, g)| *d = d.map(|nats| nats + g));
         let all = [chosen, vec![hypothesis.clone()]].concat();
