@@ -12,6 +12,9 @@ use std::collections::BTreeMap;
 /// ranges.
 const BEYOND: f64 = 0.05;
 
+/// The same, from where on the end is looked for: farther inside, a law of losses may fall.
+const LOOKED_FOR: f64 = 0.01;
+
 /// Least share of the returns that other losses leave inside of a step: where fewer are left, a law of losses ends
 /// there.
 const LEAST_USUAL: f64 = 0.4;
@@ -81,7 +84,7 @@ fn cut(frames: &[FramePair], which: &[usize], end: End) -> Option<RangeEnd> {
     }
     let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
     // The outermost place beyond which the measured side has next to nothing of what the simulation has.
-    let empty = |i: &usize| (a.len() - 1 - i) as f64 <= BEYOND * above(&b, a[*i]);
+    let empty = |i: &usize| (a.len() - 1 - i) as f64 <= LOOKED_FOR * above(&b, a[*i]);
     let outermost = a[(0..a.len()).find(empty)?];
     let at = change(&a, &b, 0.8 * outermost);
     let lost = above(&b, 1.01 * at);
@@ -326,8 +329,8 @@ mod tests {
     fn a_few_returns_beyond_an_end_do_not_hide_it() {
         let ray = |range_m: f64, matched: bool| Ray { matched, ..Ray::standing(&Vector3::new(range_m, 0.0, 0.0)) };
         let simulated = || (0..6000).map(|k| 3.0 + 0.005 * f64::from(k));
-        // One in a hundred of the nearer ones is a false alarm.
-        let measured = simulated().filter(|r| *r > 8.0).chain((0..10).map(|k| 5.4 + 0.01 * f64::from(k)));
+        // One in two hundred of the nearer ones is a false alarm.
+        let measured = simulated().filter(|r| *r > 8.0).chain((0..5).map(|k| 5.4 + 0.01 * f64::from(k)));
         let frame = FramePair::of_rays(
             String::new(),
             measured.map(|r| ray(r, true)).collect(),
