@@ -39,8 +39,7 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, places: &BTreeMap<usize, Re
         finding.reached = Some(measured.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
         let Some(promised) = finding.predicted else { continue };
-        let of_kind = || gain.kinds.get(&kind_of(finding)?).copied();
-        let part = place.map(|place| place.distances).or_else(of_kind);
+        let part = place.map(|place| place.distances).or_else(|| distances_of_kind(gain, finding));
         let parts = part.and_then(|part| Some([part, *gain.channels.get(&finding.channel)?]));
         let promised = parts.map_or(promised, |parts| promised_at_least(promised, parts));
         // What is lost in its own directions is what it was found by.
@@ -67,6 +66,11 @@ fn kind_of(finding: &Finding) -> Option<Kind> {
     Kind::of(cause_of(finding)).filter(|kind| kind.channel() == finding.channel)
 }
 
+/// Distances before, after and at the floor of the kind of differences that a finding is about.
+fn distances_of_kind(gain: &Gain, finding: &Finding) -> Option<[f64; 3]> {
+    gain.kinds.get(&kind_of(finding)?).copied()
+}
+
 /// What is gone of the difference that a finding is about: that of its `place`, its kind or its channel.
 pub(super) fn closed_of<'a>(gain: &'a Gain, place: Option<&'a Reached>, finding: &Finding) -> Option<&'a Closed> {
     match (place, kind_of(finding)) {
@@ -86,9 +90,9 @@ pub(crate) fn take_back_differences(diagnosis: &mut Diagnosis, least: f64) -> bo
     let Diagnosis { findings, gain, .. } = diagnosis;
     let mut taken = false;
     for finding in findings.iter_mut().filter(|f| f.reached.is_none() && is_applied(f, gain)) {
-        let of_kind = kind_of(finding).and_then(|kind| gain.kinds.get(&kind));
-        let part = of_kind.or_else(|| gain.channels.get(&finding.channel));
-        let Some([before, after, floor]) = part.copied() else { continue };
+        let of_channel = || gain.channels.get(&finding.channel).copied();
+        let part = distances_of_kind(gain, finding).or_else(of_channel);
+        let Some([before, after, floor]) = part else { continue };
         if before - floor < least && after - before.max(floor) > least {
             let why = ": in held-out frames the two sides do not differ by it, and the extended simulation would";
             finding.becomes_not_identifiable(why, TELL_BY);

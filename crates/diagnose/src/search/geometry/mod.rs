@@ -153,7 +153,7 @@ pub fn search(context: &Context, slide: Option<&Slide>, undo: Undo) -> Result<Ge
         result.found.push(describe::found(&search, hypothesis, &chosen, selected, gains));
     }
     let (mut displaced, swept) = (search.displacement(&chosen), search.what_is_swept(&chosen));
-    let Search { sums, .. } = &search;
+    let sums = &search.sums;
     displaced.frames = wandering(search.paired().frames, context.rig, &sums.own_prior, sums.noise_m);
     if let Some(Sheared { hypothesis, selected, gains }) = sheared {
         result.distance.iter_mut().zip(&gains).for_each(|(d, g)| *d = d.map(|nats| nats + g));
