@@ -290,7 +290,8 @@ impl Engine<'_> {
         self.finished(7);
         results.extend([Side::Labels, Side::Objects].map(|s| search::labels::search(&context, s, &known.displaced)));
         self.finished(SEARCHES);
-        search::confounders::drop_confounded(&mut results);
+        let held_out = context.blocks(&context.of(crate::inference::roles::Role::HoldOut));
+        search::confounders::drop_confounded(&mut results, &held_out);
         if known.slide.is_none() {
             notes.extend(search::set_aside(&mut results));
         }
@@ -355,10 +356,11 @@ impl Engine<'_> {
         let seen = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
         let (packets, arrived) = search::packets::search(&seen, self.sensors);
         let seen = Context { frames: arrived.as_deref().unwrap_or(seen.frames), ..seen };
-        let (of_bright, without_halos) = search::bright_targets::search(&seen);
+        let displaced_as_a_whole = known.shown() != Shown::InPlace;
+        let (of_bright, without_halos) = search::bright_targets::search(&seen, displaced_as_a_whole);
         let seen = Context { frames: without_halos.as_deref().unwrap_or(seen.frames), ..seen };
         let (hidden, mask) = search::mask::search(&seen, known.shown());
-        let hits = search::hits::search(&seen, &mask, known.shown() != Shown::InPlace);
+        let hits = search::hits::search(&seen, &mask, displaced_as_a_whole);
         let mut results = vec![packets, hidden, hits];
         results.extend(of_bright);
         self.finished(5);

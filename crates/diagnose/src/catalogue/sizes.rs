@@ -57,7 +57,7 @@ sizes! {
     TAILS_MORE = 0.2 "share": "the same, of those that the simulated side has", "things of the world are in the tails";
 
     // Losses.
-    LOST_SHARE = 0.005 "share": "lost share of returns, root mean square", "one in two hundred; laws differ by as much";
+    LOST_SHARE = 0.005 "share": "returns that are lost", "one in two hundred; laws of losses differ by as much";
     LOST_OF_KIND = 0.03 "share": "returns that are lost of one kind of surface", "their angles are known less well";
     LOST_SPREAD = 0.02 "share": "spread of the share lost over rows, azimuth or range", "laws leave about as much";
     PATCH_SHARE = 3e-4 "share": "returns that a patch of directions loses, of all", "one in three thousand";

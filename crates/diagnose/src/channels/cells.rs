@@ -44,9 +44,14 @@ pub fn cell(ray: &Ray) -> Option<usize> {
     if !(ray.range_m > 0.5) {
         return None;
     }
-    let r = (f64::from(ray.range_m).ln() / RANGE_STEP).floor().clamp(0.0, RANGE_BINS as f64 - 1.0) as usize;
+    let r = range_bin(f64::from(ray.range_m));
     let c = (-cos.ln() / COS_STEP).floor().clamp(0.0, COS_BINS as f64 - 1.0) as usize;
     Some((zone * COS_BINS + c) * RANGE_BINS + r)
+}
+
+/// Bin of the logarithm of a range, m.
+pub fn range_bin(range_m: f64) -> usize {
+    (range_m.ln() / RANGE_STEP).floor().clamp(0.0, RANGE_BINS as f64 - 1.0) as usize
 }
 
 /// Zone of a ray's surface; `None` without one.

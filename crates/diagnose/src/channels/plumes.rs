@@ -1,6 +1,7 @@
 //! The air behind vehicles, where wheels throw up water and dust, and as a comparison the air before them.
 
-use crate::pairing::FramePair;
+use super::mask::on_ego_vehicle;
+use crate::pairing::{FramePair, Ray};
 use geometry::Box3;
 use nalgebra::Point3;
 use sensor::directions::in_or_beside;
@@ -154,7 +155,8 @@ pub fn plume_frame(
         return out;
     }
     for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
-        for (i, ray) in rays.iter().enumerate().filter(|(_, ray)| ray.is_in_the_air()) {
+        let in_the_air = |ray: &Ray| ray.is_in_the_air() && !on_ego_vehicle(ray);
+        for (i, ray) in rays.iter().enumerate().filter(|(_, ray)| in_the_air(ray)) {
             let point: [f64; 3] = ray.point(&origins[ray.sensor as usize]).into();
             if airs.iter().any(|air| air.place == 0 && air.is_around(point)) {
                 out.around[side].insert(i);

@@ -10,7 +10,7 @@ use sensor::directions::{
 };
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
-const BESIDE_M: f64 = 0.5;
+pub const BESIDE_M: f64 = 0.5;
 
 /// Predictor of the simulated side of one sensor.
 pub(super) struct Predictor<'a> {

@@ -1,12 +1,14 @@
 //! Bright targets: halos of false returns at their range (blooming), and shots beside them that return nothing.
 
+use super::hits::LOST_DISPLACED;
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter, with_error};
 use crate::catalogue::sizes::BRIGHT_SHARE;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity, Unit};
 use crate::channels::brightness::Brightness;
 use crate::channels::halos::{
-    Around, BINS, HaloFrame, Profile, angle_rad, halo_frame, thresholds, total, without_halos,
+    Around, BINS, HaloFrame, Profile, Shared, UsualLosses, angle_rad, halo_frame, thresholds, total, without_halos,
 };
+use crate::channels::mean::origins;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
 use crate::inference::bisect;
@@ -76,6 +78,15 @@ impl What {
         }
     }
 
+    /// To how many of the shots it usually happens, up to a factor that all angles have in common: surfaces of some
+    /// kinds at some ranges are lost more often than others.
+    fn usually(self, around: &Around) -> f64 {
+        match self {
+            What::Halo => around.free,
+            What::Dark => around.usually_lost,
+        }
+    }
+
     fn shape(self, bin: usize, reach_rad: f64) -> f64 {
         let angle = angle_rad(bin) / reach_rad;
         match self {
@@ -93,7 +104,8 @@ impl What {
     }
 }
 
-/// Rates by angle: that around edges which are not bright, at the level of bright targets far off, and beyond it a law.
+/// Rates by angle: that of surfaces as there are around edges which are not bright, at the level of bright targets far
+/// off, and beyond it a law.
 #[derive(Clone, Copy, Debug)]
 struct Law {
     what: What,
@@ -106,15 +118,26 @@ struct Law {
 impl Law {
     /// Fitted to the profiles of some frames.
     fn of(what: What, frames: &[&HaloFrame]) -> Law {
-        let bright = total(frames.iter().map(|f| &f.bright)).map(|a| what.counts(&a));
-        let usual = total(frames.iter().map(|f| &f.usual)).map(|a| what.counts(&a));
-        let sum = |of: &[[f64; 2]]| of.iter().fold([0.0; 2], |s, c| [s[0] + c[0], s[1] + c[1]]);
-        let [all, happened] = sum(&usual);
-        let rate = (happened + 0.5) / all.max(1.0);
-        let near_edges = usual.map(|[n, k]| (k + SMOOTHING * rate) / (n + SMOOTHING));
-        let expected: f64 = (FAR..BINS).map(|i| near_edges[i] * bright[i][0]).sum();
+        let [near_bright, near_edges] =
+            [total(frames.iter().map(|f| &f.bright)), total(frames.iter().map(|f| &f.usual))];
+        let of = |profile: &Profile| profile.map(|a| (what.counts(&a), what.usually(&a)));
+        let (bright, edges) = (of(&near_bright), of(&near_edges));
+        let sum = |of: &[([f64; 2], f64)]| {
+            of.iter().fold([0.0; 3], |s, ([n, k], usually)| [s[0] + n, s[1] + k, s[2] + usually])
+        };
+        let [all, happened, usually] = sum(&edges);
+        // Beside what usually happens to the surfaces there.
+        let ratio = (happened + 0.5) / usually.max(0.5);
+        let smoothing = SMOOTHING * usually / all.max(1.0);
+        let near_edges = edges.map(|([_, k], usually)| (k + smoothing * ratio) / (usually + smoothing).max(1e-9));
+        let expected: f64 = (FAR..BINS).map(|i| near_edges[i] * bright[i].1).sum();
         let level = ((sum(&bright[FAR..])[1] + 1.0) / (expected + 1.0)).clamp(0.2, 5.0);
-        let none = Law { what, base: near_edges.map(|b| (level * b).min(1.0)), size: 0.0, reach_rad: REACH_RAD[0] };
+        let base = std::array::from_fn(|i| {
+            let ([shots, _], usually) = bright[i];
+            (level * near_edges[i] * usually / shots.max(1.0)).min(1.0)
+        });
+        let bright = bright.map(|(counts, _)| counts);
+        let none = Law { what, base, size: 0.0, reach_rad: REACH_RAD[0] };
         let ratio = (REACH_RAD[1] / REACH_RAD[0]).ln() / (REACHES - 1) as f64;
         let reaches = (0..REACHES).map(|k| REACH_RAD[0] * (ratio * k as f64).exp());
         let laws = reaches.map(|reach_rad| none.with_reach(reach_rad, &bright));
@@ -162,17 +185,20 @@ fn counts(what: What, profile: &Profile) -> [[f64; 2]; BINS] {
     profile.map(|around| what.counts(&around))
 }
 
-/// Results by channel, and the frames without what was found; `None` where nothing was.
-pub fn search(context: &Context) -> ([ChannelResult; 2], Option<Vec<FramePair>>) {
+/// Results by channel, and the frames without what was found; `None` where nothing was. `displaced` says that the
+/// measured scene is turned or moved as a whole: silhouettes do not match, and small losses are an effect of that.
+pub fn search(context: &Context, displaced: bool) -> ([ChannelResult; 2], Option<Vec<FramePair>>) {
     let hold_out = context.of(Role::HoldOut).len();
     let mut results = [What::Halo, What::Dark].map(|what| ChannelResult::new(what.channel(), hold_out));
     let simulated = context.frames.iter().flat_map(|f| &f.simulated);
     let Some(brightness) = Brightness::of(simulated) else { return (results, None) };
-    let sensors = context.rig.sensors.len();
+    let origins = origins(context.rig);
     let select = context.of(Role::Select);
+    let losses = UsualLosses::of(select.iter().map(|&f| &context.frames[f]));
+    let shared = |least: f64| Shared { brightness: &brightness, least, origins: &origins, losses: &losses };
     // The brightness from which on a target is bright is that by which most is explained.
     let at = |least: f64| {
-        let of_frame = |f: &FramePair| halo_frame(f, sensors, &brightness, least);
+        let of_frame = |f: &FramePair| halo_frame(f, &shared(least));
         let profiles: Vec<HaloFrame> = context.frames.par_iter().map(of_frame).collect();
         let nats = |what| cross_gains(context, what, &profiles, &select).iter().sum::<f64>().max(0.0);
         (nats(What::Halo) + nats(What::Dark), least, profiles)
@@ -181,12 +207,12 @@ pub fn search(context: &Context) -> ([ChannelResult; 2], Option<Vec<FramePair>>)
     let Some((_, least, profiles)) = best else { return (results, None) };
     let mut ends_rad = [0.0; 2];
     for ((what, result), end) in [What::Halo, What::Dark].into_iter().zip(&mut results).zip(&mut ends_rad) {
-        if let Some(law) = search_one(context, what, &profiles, result) {
+        if let Some(law) = search_one(context, (what, displaced), &profiles, result) {
             *end = what.end_rad(law.reach_rad);
         }
     }
     let found = ends_rad.iter().any(|end| *end > 0.0);
-    let without = |f: &FramePair| without_halos(f, sensors, &brightness, least, ends_rad);
+    let without = |f: &FramePair| without_halos(f, &shared(least), ends_rad);
     (results, found.then(|| context.frames.par_iter().map(without).collect()))
 }
 
@@ -197,7 +223,13 @@ fn cross_gains(context: &Context, what: What, profiles: &[HaloFrame], select: &[
     cross_validated(&context.blocks(select), fit, |law, i| law.gain_of(on_select[i]))
 }
 
-fn search_one(context: &Context, what: What, profiles: &[HaloFrame], result: &mut ChannelResult) -> Option<Law> {
+fn search_one(
+    context: &Context,
+    (what, displaced): (What, bool),
+    profiles: &[HaloFrame],
+    result: &mut ChannelResult,
+) -> Option<Law> {
+    let least = BRIGHT_SHARE + if displaced && what == What::Dark { LOST_DISPLACED } else { 0.0 };
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let on = |which: &[usize]| which.iter().map(|&f| &profiles[f]).collect::<Vec<_>>();
     let gains = cross_gains(context, what, profiles, &select);
@@ -210,7 +242,7 @@ fn search_one(context: &Context, what: What, profiles: &[HaloFrame], result: &mu
         "no more around bright targets than around other edges"
     } else if [&chosen, &law].iter().any(|law| law.reach_rad > 0.99 * REACH_RAD[1]) {
         "as far from bright targets as is looked at: not around them"
-    } else if chosen.size < BRIGHT_SHARE || law.size < BRIGHT_SHARE.max(1.96 * errors[0]) {
+    } else if chosen.size < least || law.size < least.max(1.96 * errors[0]) {
         "too small to speak of"
     } else if law.reach_rad < 1.96 * errors[1] || confirmed <= demands.nats {
         "other frames do not confirm it"
@@ -218,7 +250,7 @@ fn search_one(context: &Context, what: What, profiles: &[HaloFrame], result: &mu
         "chosen"
     };
     result.consider(what.cause(), (nats, z), context.returns(&select), outcome);
-    result.minimum.push((what.cause(), Minimum::new(what.size(), BRIGHT_SHARE)));
+    result.minimum.push((what.cause(), Minimum::new(what.size(), least)));
     if outcome != "chosen" {
         return None;
     }
@@ -314,7 +346,7 @@ mod tests {
         let mut rng = data::stream(3, "halos", 0, 0);
         let mut around = |more: f64, n: usize| {
             let happened = (0..n).filter(|_| rng.random_bool((0.01 + more).min(1.0))).count() as f64;
-            Around { free: n as f64, returns: happened, shots: n as f64, lost: happened }
+            Around { free: n as f64, returns: happened, shots: n as f64, lost: happened, usually_lost: 0.01 * n as f64 }
         };
         let mut one = || HaloFrame {
             bright: std::array::from_fn(|i| around(rate(angle_rad(i)), 8 + 3 * i)),

@@ -36,6 +36,10 @@ use std::collections::BTreeMap;
 /// never exactly that of the sensor.
 const RICHER_SHARE: f64 = 0.01;
 
+/// Share of the returns of some part of a scene that may be lost where the scene is displaced as a whole: silhouettes
+/// do not match.
+pub(super) const LOST_DISPLACED: f64 = 0.1;
+
 /// Bootstrap repetitions of the fits.
 const REFITS: usize = 40;
 
@@ -114,16 +118,15 @@ impl<'a> Search<'a> {
         let most = |zone: Option<usize>| if last.numbers[0] < 0.0 { table.only_measured(zone) } else { f64::INFINITY };
         match last.law {
             Law::Zone(zone) => {
-                // The angle of incidence is not known on curved bodies: what the laws before it may lose there is no
-                // material.
-                let on_round = if zone >= OBJECT { table.lost_on_round(before, zone) } else { 0.0 };
-                let beside = on_round.max(0.07 * joins);
-                own.min(most(Some(zone))) > LOST_OF_KIND + beside + 0.1 * self.displaced
+                // The angle of incidence is not known on curved bodies: whatever it is, a material loses.
+                let on_round = if joins > 0.0 && zone >= OBJECT { lost_on_round(table, laws) } else { own };
+                let lost = own.min(on_round).min(most(Some(zone)));
+                lost > LOST_OF_KIND + 0.07 * joins + LOST_DISPLACED * self.displaced
             }
             Law::Random => own.min(most(None)) > LOST_SHARE + 0.02 * joins + 0.01 * self.displaced,
             _ => {
-                let least = LOST_SHARE + 0.005 * joins + 0.01 * self.displaced;
-                table.changed(laws, before).min(table.changed(laws, alone)) > least
+                let lost = (table.lost(laws) - table.lost(before)).abs();
+                lost.min(table.changed(laws, alone)) > LOST_SHARE + 0.005 * joins + 0.01 * self.displaced
             }
         }
     }
@@ -262,6 +265,12 @@ impl<'a> Search<'a> {
 /// Counts over some frames.
 fn table(hits: &[HitFrame], frames: &[usize]) -> LossTable {
     LossTable::new(total(frames.iter().map(|&i| &hits[i])))
+}
+
+/// Share that the last of some laws loses where objects are met at all cosines of incidence alike.
+fn lost_on_round(table: &LossTable, laws: &[FittedLaw]) -> f64 {
+    let laws: Vec<Law> = laws.iter().map(|l| l.law).collect();
+    refit(&table.of_round_objects(), &laws).last().map_or(0.0, |l| l.numbers[0])
 }
 
 /// Fits laws one on top of the other.

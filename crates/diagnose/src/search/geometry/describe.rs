@@ -2,8 +2,9 @@
 
 use super::beside_rows;
 use super::curve::linear_curve;
-use super::floor::{FLOOR_GROUPS, FLOOR_SWEEP};
-use super::hypotheses::Hypothesis;
+use super::floor::{FLOOR_GROUPS, FLOOR_SWEEP, is_attitude_alone};
+use super::hypotheses::{Hypothesis, is_attitude};
+use super::reported::fit_of;
 use super::steadiness::come_with_time;
 use super::sums::{Sums, group_fit, row_columns, split};
 use super::{Search, Selected};
@@ -50,7 +51,12 @@ pub(super) fn found(
         Hypothesis::Groups { grouping, column, .. } => groups(search, cause, *grouping, *column, chosen),
     };
     let named = cause != Cause::Unexplained;
-    let rivals = selected.rivals.iter().copied().filter(|r| named && *r != Cause::Unexplained);
+    let mut rivals = selected.rivals;
+    let may_lean = is_attitude_alone(&search.sums, &fit_of(search, chosen), hypothesis);
+    if may_lean && !rivals.contains(&Cause::PitchRoll) && !chosen.iter().any(is_attitude) {
+        rivals.push(Cause::PitchRoll);
+    }
+    rivals.retain(|r| named && *r != Cause::Unexplained);
     let causes: Vec<Cause> = std::iter::once(cause).filter(|_| named).chain(rivals).collect();
     let status = match causes.len() {
         0 => Status::Unexplained,
@@ -88,8 +94,7 @@ fn drift(sums: &Sums, columns: &[usize], parameters: &[NamedParameter]) -> Optio
 /// Describes a linear hypothesis.
 fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis]) -> Description {
     let (sums, rig) = (&search.sums, search.context.rig);
-    let reported = search.reported.as_ref().map(|reported| reported.linear.clone());
-    let fitted = reported.unwrap_or_else(|| sums.fit_all(&search.estimate, &search.estimate_blocks, chosen));
+    let fitted = fit_of(search, chosen);
     let spurious = spurious_poses(search, columns, chosen);
     let parameters = linear_parameters(sums, rig, &fitted, columns, spurious, cause);
     let is_sensor = |id: &ParameterId| *id == ParameterId::Of(Quantity::Sensor);

@@ -11,6 +11,7 @@ use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
 use crate::channels::moments::COURSES;
 use crate::inference::grouped;
+use crate::inference::linear::LinearFit;
 use nalgebra::{DMatrix, DVector};
 
 /// Smallest displacement over a scan that is reported: along x and y, m; about z, rad.
@@ -76,13 +77,19 @@ pub(super) fn sizable(sums: &Sums, frames: &[usize], blocks: &[usize], hypothese
         .collect()
 }
 
-/// Whether the last of some hypotheses, fitted together, is a pose of the only sensor of which nothing but roll and
-/// pitch is large enough to be reported: the ego vehicle may have that attitude.
-pub(super) fn is_attitude_alone(sums: &Sums, frames: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> bool {
-    let Some(Hypothesis::Linear { cause: Cause::SensorExtrinsics, columns }) = hypotheses.last() else { return false };
-    let is_turn = |column: &Column| matches!(column, Column::Pose(0 | 1));
-    columns.iter().all(|&c| matches!(sums.columns[c], Column::Pose(_)))
-        && sizable(sums, frames, blocks, hypotheses).iter().all(is_turn)
+/// Whether a hypothesis is a pose of the only sensor of which nothing but roll and pitch is large enough to be reported
+/// and differs from zero: the ego vehicle may have that attitude.
+pub(super) fn is_attitude_alone(sums: &Sums, fitted: &LinearFit, hypothesis: &Hypothesis) -> bool {
+    let Hypothesis::Linear { cause: Cause::SensorExtrinsics, columns } = hypothesis else { return false };
+    let is_sizable = |column: usize| {
+        let of = sums.fitted(fitted, sums.columns[column]);
+        of.is_some_and(|[value, error]| value.abs() >= sums.smallest(column).max(1.96 * error))
+    };
+    columns.iter().all(|&c| match sums.columns[c] {
+        Column::Pose(0 | 1) => true,
+        Column::Pose(_) => !is_sizable(c),
+        _ => false,
+    })
 }
 
 impl Sums {
@@ -195,16 +202,20 @@ mod tests {
 
     #[test]
     fn a_pose_of_the_only_sensor_without_yaw_and_shift_may_be_an_attitude() {
-        let alone = |[pitch, yaw, ahead_m]: [f64; 3]| {
+        let alone = |[pitch, yaw, ahead_m]: [f64; 3], variance: f64| {
             let gram = DMatrix::identity(3, 3) * 1e6;
             let linear = LinearFrame { right: &gram * DVector::from_row_slice(&[pitch, yaw, ahead_m]), gram };
             let columns = vec![Column::Pose(1), Column::Pose(2), Column::Pose(3)];
             let sums = Sums { columns, precision: vec![25.0; 3], base: vec![], linear: vec![linear], ..sums() };
-            let pose = |cause| [Hypothesis::Linear { cause, columns: vec![0, 1, 2] }];
-            assert!(!is_attitude_alone(&sums, &[0], &[0], &pose(Cause::RangeBias)));
-            is_attitude_alone(&sums, &[0], &[0], &pose(Cause::SensorExtrinsics))
+            let pose = |cause| Hypothesis::Linear { cause, columns: vec![0, 1, 2] };
+            let mut fitted = sums.fit_all(&[0], &[0], &[pose(Cause::SensorExtrinsics)]);
+            fitted.covariance *= variance;
+            assert!(!is_attitude_alone(&sums, &fitted, &pose(Cause::RangeBias)));
+            is_attitude_alone(&sums, &fitted, &pose(Cause::SensorExtrinsics))
         };
-        assert!(alone([5e-3, 2e-4, 0.02]));
-        assert!(!alone([5e-3, 2e-3, 0.02]) && !alone([5e-3, 2e-4, 0.06]));
+        assert!(alone([5e-3, 2e-4, 0.02], 1.0));
+        assert!(!alone([5e-3, 3e-3, 0.02], 1.0) && !alone([5e-3, 2e-4, 0.06], 1.0));
+        // A shift of 6 cm with an error of 4 cm.
+        assert!(alone([5e-3, 2e-4, 0.06], 1600.0));
     }
 }

@@ -5,6 +5,15 @@ use super::beside_rows::{self, BesideRows};
 use super::directions;
 use super::hypotheses::Hypothesis;
 use crate::inference::linear::{LinearFit, at_least};
+use std::borrow::Cow;
+
+/// The fit that is reported.
+pub(super) fn fit_of<'a>(search: &'a Search, chosen: &[Hypothesis]) -> Cow<'a, LinearFit> {
+    match &search.reported {
+        Some(reported) => Cow::Borrowed(&reported.linear),
+        None => Cow::Owned(search.sums.fit_all(&search.estimate, &search.estimate_blocks, chosen)),
+    }
+}
 
 /// The fit on the estimating frames.
 pub(super) struct Reported {

@@ -1,8 +1,8 @@
 //! Which hypotheses are chosen: one after the other, then each anew beside the others, and of these those that hold
 //! once their displacement is undone.
 
-use super::floor::{above_floor, is_attitude_alone, sizable};
-use super::hypotheses::{Hypothesis, hypotheses, is_attitude, is_pose, may_join};
+use super::floor::{above_floor, sizable};
+use super::hypotheses::{Hypothesis, hypotheses, is_pose, may_join};
 use super::rows::drop_less_certain_rows;
 use super::{Chosen, Search, directions};
 use crate::catalogue::Cause;
@@ -178,18 +178,13 @@ impl Search<'_> {
         (chosen, selected)
     }
 
-    /// Those of the chosen hypotheses whose effect exceeds the floor on the estimating frames as well. Where nothing of
-    /// the pose of the only sensor but roll and pitch does, the ego vehicle may have that attitude.
+    /// Those of the chosen hypotheses whose effect exceeds the floor on the estimating frames as well.
     pub(super) fn large_enough(&self, (chosen, selected): Chosen) -> Chosen {
         let mut large: Chosen = (Vec::new(), Vec::new());
         for ((k, hypothesis), mut selected) in chosen.iter().enumerate().zip(selected) {
             let last = [without(&chosen, k), vec![hypothesis.clone()]].concat();
             if !above_floor(&self.sums, &self.estimate, &self.estimate_blocks, &last) {
                 continue;
-            }
-            let both = is_attitude_alone(&self.sums, &self.estimate, &self.estimate_blocks, &last);
-            if both && !selected.rivals.contains(&Cause::PitchRoll) && !chosen.iter().any(is_attitude) {
-                selected.rivals.push(Cause::PitchRoll);
             }
             // At one speed a constant pitch and one that grows with the speed are the same.
             let one_speed = self.sums.moments.drives && !self.sums.moments.speed_varies;
