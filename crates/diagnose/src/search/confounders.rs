@@ -17,7 +17,7 @@ struct Confounder {
 }
 
 /// Confounders in the order in which they are applied: a finding that is dropped confounds nothing after it.
-const CONFOUNDERS: [Confounder; 16] = [
+const CONFOUNDERS: [Confounder; 17] = [
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
@@ -93,6 +93,13 @@ const CONFOUNDERS: [Confounder; 16] = [
         because: "from where the sensor is, other things are looked over",
     },
     Confounder {
+        // An error of a seventh is a fiftieth of the gain, and objects have a twentieth of the returns.
+        effect: shapes,
+        by: ranges,
+        share: 0.001,
+        because: "ranges were corrected but for an error, and objects that look nearer look longer",
+    },
+    Confounder {
         effect: pose,
         by: unexplained_surfaces,
         share: 0.25,
@@ -136,6 +143,11 @@ fn noise(f: &Found) -> bool {
 /// Whether rows have elevation offsets.
 fn rows_aim_elsewhere(f: &Found) -> bool {
     f.is(Cause::BeamElevationOffset)
+}
+
+/// Whether ranges are off, alike or by row.
+fn ranges(f: &Found) -> bool {
+    f.is(Cause::RangeBias) || f.is(Cause::RangeDrift) || f.is(Cause::BeamRangeOffset)
 }
 
 /// Whether the scene is displaced along the scan.
@@ -364,6 +376,10 @@ mod tests {
                 (Cause::RandomDropout, Channel::Hits, 0.005, 0.7, 0.9),
             ),
             ((Some(Cause::RollingShutter), Channel::Slide, 4.0), (Cause::Outliers, Channel::Returns, 0.004, 1.9, 2.1)),
+            (
+                (Some(Cause::RangeBias), Channel::Residuals, 40.0),
+                (Cause::WrongShape, Channel::Objects, 0.1, 0.03, 0.05),
+            ),
             ((None, Channel::Residuals, 1.0), (Cause::TimeOffset, Channel::Objects, 0.002, 0.04, 0.06)),
             ((None, Channel::Residuals, 1.0), (Cause::RangeNoise, Channel::Roughness, 0.02, 0.9, 1.1)),
         ];
