@@ -32,7 +32,7 @@ use crate::diagnosis::{Diagnosis, Gain, Unidentifiable, Verdict};
 use crate::effects::{fill_effects, rows_deg};
 use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
-use crate::inference::roles::{FEWEST_FRAMES, roles};
+use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     Corrections, FramePair, RangeError, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
     kept_of_frame, pair_all, with_points,
@@ -290,7 +290,7 @@ impl Engine<'_> {
         self.finished(7);
         results.extend([Side::Labels, Side::Objects].map(|s| search::labels::search(&context, s, &known.displaced)));
         self.finished(SEARCHES);
-        let held_out = context.blocks(&context.of(crate::inference::roles::Role::HoldOut));
+        let held_out = context.blocks(&context.of(Role::HoldOut));
         search::confounders::drop_confounded(&mut results, &held_out);
         if known.slide.is_none() {
             notes.extend(search::set_aside(&mut results));

@@ -4,10 +4,9 @@
 
 use super::brightness::Brightness;
 use super::cells::{RANGE_BINS, ZONES, range_bin, zone};
-use crate::pairing::{BESIDE_M, FramePair, Lies, Ray};
+use crate::pairing::{FramePair, Lies, Ray, at_object};
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
-use sensor::directions::in_or_beside;
 use std::collections::BTreeSet;
 
 /// Width of a bin of angles, rad: a quarter of a degree.
@@ -192,17 +191,14 @@ fn profile(
     let mut out = [Around::default(); BINS];
     // What lies beside a label may be the object: vehicles are larger than simulated.
     let boxes: Vec<Box3> = frame.objects.iter().filter_map(|o| o.simulated).collect();
-    let at_object = |direction: &Vector3<f64>, range_m: f64| {
-        let place = (origin + direction * range_m).into();
-        boxes.iter().any(|b| in_or_beside(b, place, BESIDE_M))
-    };
+    let beside = |direction: &Vector3<f64>, range_m: f64| at_object(&boxes, (origin + direction * range_m).into());
     let step = (frame.simulated.len() * targets.len()).div_ceil(PAIRS).max(1);
     for ray in frame.simulated.iter().filter(|r| r.sensor == sensor).step_by(step) {
         let direction = ray.direction_vector();
         // At the edge of the target itself a return at its range is on a surface.
         let free_m = ray.own_range_m().min(f64::from(ray.near_far_m[0]));
         if let Some((bin, range_m)) = nearest(targets, &direction, |t| t.range_m + SAME_RANGE_M < free_m)
-            && !at_object(&direction, range_m)
+            && !beside(&direction, range_m)
         {
             out[bin].free += step as f64;
         }
@@ -216,7 +212,7 @@ fn profile(
     for ray in frame.measured.iter().filter(|r| r.sensor == sensor && r.lies() == Lies::InFront) {
         let direction = ray.direction_vector();
         if let Some((bin, _)) = nearest(targets, &direction, at_its_range(ray))
-            && !at_object(&direction, ray.own_range_m())
+            && !beside(&direction, ray.own_range_m())
         {
             out[bin].returns += 1.0;
         }

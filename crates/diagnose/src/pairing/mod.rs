@@ -22,7 +22,7 @@ pub use gaps::{gap_margin_m, mixed_per_rad};
 pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::{Matched, match_directions};
 pub use of_sensor::company_m;
-pub use prediction::BESIDE_M;
+pub use prediction::at_object;
 pub use ray::{Lies, OCTANTS, Ray, Surface};
 pub(crate) use recordings::load;
 pub use recordings::{PairSide, Recordings, SideFrame};

@@ -10,7 +10,7 @@ use sensor::directions::{
 };
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
-pub const BESIDE_M: f64 = 0.5;
+const BESIDE_M: f64 = 0.5;
 
 /// Predictor of the simulated side of one sensor.
 pub(super) struct Predictor<'a> {
@@ -201,7 +201,7 @@ fn others(boxes: &[Box3], origin: [f64; 3]) -> Vec<Box3> {
 }
 
 /// Whether a point lies on a labelled object or beside it.
-fn at_object(others: &[Box3], place: [f64; 3]) -> bool {
+pub fn at_object(others: &[Box3], place: [f64; 3]) -> bool {
     others.iter().any(|b| in_or_beside(b, place, BESIDE_M))
 }
 
