@@ -9,7 +9,7 @@ use crate::curve::CurvePoint;
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
 use sensor::beams::Pick;
-use sensor::directions::Sensors;
+use sensor::directions::{ScanPattern, Sensors};
 use sensor::effects::{
     AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamIntensity, BeamRangeOffset, Clock,
     CoordinateRounding, Covariate as TableCovariate, DirtyWindow, DualReturns, Effect, EgoAttitude, Empirical,
@@ -22,17 +22,29 @@ use sensor::{Rig, Sensor};
 /// A standard deviation of range that no finding reaches, m: the limit of an effect that has to be given one.
 const NO_LIMIT_M: f64 = 10.0;
 
-/// Elevations of the rows of each sensor, degrees; none where they are not known.
-pub(crate) fn rows_deg(sensors: &Sensors) -> Vec<Vec<f64>> {
-    let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
-    sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect()
+/// The rows of a sensor; none where they are not known.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct RowsOf {
+    /// Elevations, degrees.
+    pub deg: Vec<f64>,
+    /// Heights of the origins of their rays, m; empty where they start at that of the sensor.
+    pub heights_m: Vec<f64>,
 }
 
-/// Gives every finding its effects. `rows_deg` holds the elevations of the rows of every sensor.
-pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<f64>]) {
+/// The rows of each sensor.
+pub(crate) fn rows_of(sensors: &Sensors) -> Vec<RowsOf> {
+    let of_pattern = |p: &ScanPattern| RowsOf {
+        deg: p.rows_rad.iter().map(|r| f64::from(*r).to_degrees()).collect(),
+        heights_m: p.heights_m.iter().map(|m| f64::from(*m)).collect(),
+    };
+    sensors.patterns.iter().map(of_pattern).collect()
+}
+
+/// Gives every finding its effects. `rows` holds the rows of every sensor.
+pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows: &[RowsOf]) {
     for finding in findings.iter_mut() {
         if finding.effects.is_empty() {
-            finding.effects = effects_of(finding, rig, rows_deg);
+            finding.effects = effects_of(finding, rig, rows);
         }
         // What the simulator would refuse is no effect of it.
         finding.effects.retain(|effect| effect.model().check().is_ok());
@@ -41,11 +53,11 @@ pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<
 
 /// The effects of a finding; none where the sensor model has none for it. Of an ambiguous finding those of its first
 /// candidate.
-pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
+pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows: &[RowsOf]) -> Vec<Effect> {
     match finding.status {
-        Status::Unexplained => tables(finding, rig, rows_deg),
+        Status::Unexplained => tables(finding, rig, rows),
         Status::NotIdentifiable => Vec::new(),
-        _ => named(finding, rig, rows_deg),
+        _ => named(finding, rig, rows),
     }
 }
 
@@ -73,7 +85,7 @@ fn positive(strength: f64, effect: impl Into<Option<Effect>>) -> Vec<Effect> {
 
 /// The effects of a named cause.
 #[expect(clippy::too_many_lines, reason = "a table: one arm for each cause")]
-fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
+fn named(f: &Finding, rig: &Rig, rows: &[RowsOf]) -> Vec<Effect> {
     let value = |quantity: Quantity| value(f, quantity);
     let effect = match cause_of(f) {
         Cause::RangeNoise => return range_noise(f),
@@ -93,17 +105,19 @@ fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
             Effect::RangeBias(RangeBias { offset_m: value(Quantity::OffsetM), scale: value(Quantity::Scale) })
         }
         Cause::BeamRangeOffset => {
-            let of_sensor = |(sensor, rows_deg, offsets_m)| {
-                Effect::BeamRangeOffset(BeamRangeOffset { std_m: 0.0, offsets_m, sensor, rows_deg })
+            let of_sensor = |(sensor, rows, offsets_m): (String, RowsOf, Vec<f64>)| {
+                let RowsOf { deg: rows_deg, heights_m } = rows;
+                Effect::BeamRangeOffset(BeamRangeOffset { std_m: 0.0, offsets_m, sensor, rows_deg, heights_m })
             };
-            return row_tables(f, rig, rows_deg, 4).into_iter().map(of_sensor).collect();
+            return row_tables(f, rig, rows, 4).into_iter().map(of_sensor).collect();
         }
-        Cause::BeamElevationOffset => return row_elevations(f, rig, rows_deg),
+        Cause::BeamElevationOffset => return row_elevations(f, rig, rows),
         Cause::BeamIntensity => {
-            let of_sensor = |(sensor, rows_deg, gains_ln)| {
-                Effect::BeamIntensity(BeamIntensity { std: 0.0, gains_ln, sensor, rows_deg })
+            let of_sensor = |(sensor, rows, gains_ln): (String, RowsOf, Vec<f64>)| {
+                let RowsOf { deg: rows_deg, heights_m } = rows;
+                Effect::BeamIntensity(BeamIntensity { std: 0.0, gains_ln, sensor, rows_deg, heights_m })
             };
-            return row_tables(f, rig, rows_deg, 4).into_iter().map(of_sensor).collect();
+            return row_tables(f, rig, rows, 4).into_iter().map(of_sensor).collect();
         }
         Cause::Quantisation => Effect::RangeQuantisation(RangeQuantisation { step_m: value(Quantity::StepM) }),
         Cause::AngularJitter => {
@@ -181,10 +195,10 @@ fn rolling_shutter(f: &Finding) -> Effect {
     Effect::RollingShutter(RollingShutter { deskewed: false, scan_s, uneven, only_objects, slide })
 }
 
-/// Name, elevations of the rows and values of each sensor of which the finding has rows; rows without a value have 0.
-fn row_tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>], places: i32) -> Vec<(String, Vec<f64>, Vec<f64>)> {
-    let of_sensor = |(sensor, rows_deg): (&Sensor, &Vec<f64>)| {
-        let mut values = vec![0.0; rows_deg.len()];
+/// Name, rows and values of each sensor of which the finding has rows; rows without a value have 0.
+fn row_tables(f: &Finding, rig: &Rig, rows: &[RowsOf], places: i32) -> Vec<(String, RowsOf, Vec<f64>)> {
+    let of_sensor = |(sensor, rows): (&Sensor, &RowsOf)| {
+        let mut values = vec![0.0; rows.deg.len()];
         for (id, p) in &f.parameters {
             match id {
                 ParameterId::Row { sensor: of, row } if *of == sensor.name && *row < values.len() => {
@@ -193,25 +207,29 @@ fn row_tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>], places: i32) -> Vec
                 _ => {}
             }
         }
-        let rows_deg: Vec<f64> = rows_deg.iter().map(|deg| rounded(*deg, 5)).collect();
-        let known = rows_deg.len() > 1 && values.iter().any(|v| *v != 0.0);
-        known.then(|| (sensor.name.clone(), rows_deg, values))
+        let rows = RowsOf {
+            deg: rows.deg.iter().map(|deg| rounded(*deg, 5)).collect(),
+            heights_m: rows.heights_m.iter().map(|m| rounded(*m, 4)).collect(),
+        };
+        let known = rows.deg.len() > 1 && values.iter().any(|v| *v != 0.0);
+        known.then(|| (sensor.name.clone(), rows, values))
     };
-    rig.sensors.iter().zip(rows_deg).filter_map(of_sensor).collect()
+    rig.sensors.iter().zip(rows).filter_map(of_sensor).collect()
 }
 
 /// Errors of the rows' elevations as tables; for all rows alike where the finding has no rows.
-fn row_elevations(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
-    let error = |(sensor, rows_deg, elevations_deg)| BeamAngleError {
+fn row_elevations(f: &Finding, rig: &Rig, rows: &[RowsOf]) -> Vec<Effect> {
+    let error = |(sensor, rows, elevations_deg): (String, RowsOf, Vec<f64>)| BeamAngleError {
         elevation_deg: value(f, Quantity::MeanDeg),
         sensor,
-        rows_deg,
+        rows_deg: rows.deg,
+        heights_m: rows.heights_m,
         elevations_deg,
         ..BeamAngleError::default()
     };
-    let tables = row_tables(f, rig, rows_deg, 5);
+    let tables = row_tables(f, rig, rows, 5);
     let effects: Vec<BeamAngleError> = match tables.is_empty() {
-        true => vec![error((String::new(), vec![], vec![]))],
+        true => vec![error((String::new(), RowsOf::default(), vec![]))],
         false => tables.into_iter().map(error).collect(),
     };
     effects.into_iter().map(Effect::BeamAngleError).collect()
@@ -239,9 +257,9 @@ fn dirty_window(f: &Finding, rig: &Rig) -> Option<Effect> {
 }
 
 /// An unexplained finding: for each sensor a table along its covariate.
-fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
+fn tables(f: &Finding, rig: &Rig, rows: &[RowsOf]) -> Vec<Effect> {
     let of_sensor = |(number, sensor): (usize, &Sensor)| {
-        let table = table_of_sensor(f, number, rows_deg);
+        let table = table_of_sensor(f, number, rows);
         if table.is_empty() {
             return None;
         }
@@ -267,11 +285,11 @@ fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
 }
 
 /// Place and value of the points of one sensor's curve, ascending.
-fn table_of_sensor(f: &Finding, sensor: usize, rows_deg: &[Vec<f64>]) -> Vec<[f64; 2]> {
+fn table_of_sensor(f: &Finding, sensor: usize, rows: &[RowsOf]) -> Vec<[f64; 2]> {
     let usual = f.parameter(Quantity::SimulatedStdM).map_or(0.0, |p| p.estimate.max(0.0));
     let own = f.curve.points.iter().filter(|p| p.sensor == sensor);
     let point = |p: &CurvePoint| {
-        let at = if f.covariate == Covariate::Row { *rows_deg.get(sensor)?.get(p.x as usize)? } else { p.x };
+        let at = if f.covariate == Covariate::Row { *rows.get(sensor)?.deg.get(p.x as usize)? } else { p.x };
         let value = match f.channel {
             Channel::Hits => (1.0 - p.after).clamp(0.0, 1.0),
             Channel::Roughness => usual * (p.after * p.after - 1.0).max(0.0).sqrt(),

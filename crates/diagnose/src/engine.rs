@@ -29,7 +29,7 @@ use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::motion;
 use crate::diagnosis::{Diagnosis, Gain, Unidentifiable, Verdict};
-use crate::effects::{fill_effects, rows_deg};
+use crate::effects::{fill_effects, rows_of};
 use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
@@ -296,11 +296,11 @@ impl Engine<'_> {
             notes.extend(search::set_aside(&mut results));
         }
         let corrected = corrected(&context, &results);
-        let rows_deg = rows_deg(self.sensors);
+        let rows = rows_of(self.sensors);
         let mut diagnosis = report(&context, results, notes);
         baked_in::take_names(&mut diagnosis, self.baked_in);
-        add_what_is_lacking(&mut diagnosis, rows_deg.iter().any(|rows| !rows.is_empty()));
-        fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
+        add_what_is_lacking(&mut diagnosis, rows.iter().any(|rows| !rows.deg.is_empty()));
+        fill_effects(&mut diagnosis.findings, context.rig, &rows);
         (self.progress)(Stage::Verifying, 0, 1);
         let found = diagnosis.findings.iter().map(|f| f.channel).collect();
         let verification = Verification::new(self, &recorded, found, places_of(&diagnosis.findings, context.rig));

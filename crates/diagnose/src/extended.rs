@@ -139,7 +139,7 @@ mod tests {
     use crate::catalogue::{Channel, Unit};
     use crate::curve::{Curve, CurvePoint};
     use crate::diagnosis::{FindingGain, Gain, Parameter, SCHEMA, Verdict};
-    use crate::effects::fill_effects;
+    use crate::effects::{RowsOf, fill_effects};
     use sensor::Rig;
     use sensor::effects::{BeamAngleError, EgoAttitude, RandomDropout, RangeBias};
 
@@ -174,7 +174,7 @@ mod tests {
     }
 
     fn diagnosis(mut findings: Vec<Finding>) -> Diagnosis {
-        fill_effects(&mut findings, &Rig::single(), &[vec![-5.0, -4.0]]);
+        fill_effects(&mut findings, &Rig::single(), &[RowsOf { deg: vec![-5.0, -4.0], heights_m: vec![] }]);
         Diagnosis {
             schema: SCHEMA.into(),
             build: data::build_id().into(),

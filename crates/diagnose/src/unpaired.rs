@@ -12,7 +12,7 @@ mod sides;
 use crate::catalogue::Channel;
 use crate::channels::mask::Shown;
 use crate::diagnosis::{Diagnosis, Finding, Gain, Status, Verdict};
-use crate::effects::{fill_effects, rows_deg};
+use crate::effects::{RowsOf, fill_effects, rows_of};
 use crate::engine::{Options, Outcome, Progress, Remake, Stage, refused, report, set_reached};
 use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
@@ -117,8 +117,8 @@ pub fn diagnose_unpaired(
     progress(Stage::Comparing, 1, 1);
     let (unpaired, recorded) = look(rig, a, b, progress)?;
     let contexts = unpaired.contexts(&recorded);
-    let (mut diagnosis, rows_deg) = search_all(&unpaired, &contexts, notes, progress)?;
-    fill_effects(&mut diagnosis.findings, rig, &rows_deg);
+    let (mut diagnosis, rows) = search_all(&unpaired, &contexts, notes, progress)?;
+    fill_effects(&mut diagnosis.findings, rig, &rows);
     let made_from = made_from(measured, simulated, rig);
     progress(Stage::Verifying, 0, 1);
     let verification = Verification::new(&unpaired, &contexts);
@@ -195,7 +195,7 @@ fn search_all(
     contexts: &Contexts,
     notes: Vec<String>,
     progress: Progress,
-) -> Result<(Diagnosis, Vec<Vec<f64>>), DiagnoseError> {
+) -> Result<(Diagnosis, Vec<RowsOf>), DiagnoseError> {
     const SEARCHES: usize = 5;
     let finished = |searches: usize| progress(Stage::Weighing, searches, SEARCHES);
     finished(0);
@@ -228,7 +228,7 @@ fn search_all(
     }
     diagnosis.cannot_tell(limits::not_identifiable());
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
-    Ok((diagnosis, rows_deg(&unpaired.side.sensors)))
+    Ok((diagnosis, rows_of(&unpaired.side.sensors)))
 }
 
 /// What recording tells noise of the sensor from rough surfaces.

@@ -132,11 +132,11 @@ impl CloudReader {
             echo.move_point([cloud.values[at], cloud.values[at + 1], cloud.values[at + 2]]);
         }
         if self.reads.pattern {
-            for (&place, (azimuth, elevation)) in places.iter().zip(scan.azimuth_rad.iter().zip(&scan.elevation_rad)) {
+            for (i, &place) in places.iter().enumerate() {
                 let echo = &mut echoes[place as usize];
-                if let Some(row) = pattern.row(*elevation) {
+                if let Some(row) = pattern.row(scan.elevation_rad[i], scan.range_m[i]) {
                     echo.row = (pattern.rows_rad.len() - 1 - row) as u16;
-                    let column = (azimuth + std::f32::consts::PI) / pattern.steps.azimuth_rad;
+                    let column = (scan.azimuth_rad[i] + std::f32::consts::PI) / pattern.steps.azimuth_rad;
                     echo.column = column.round().clamp(0.0, 65_534.0) as u16;
                 }
                 place_in_pattern(echo, sensor, &pose);
@@ -193,9 +193,9 @@ impl CloudReader {
             let (pose, step) = (sensor.pose(), pattern.steps.azimuth_rad);
             let origin = sensor.position.map(|v| v as f32);
             let mut rows: Vec<Vec<f32>> = vec![Vec::new(); pattern.rows_rad.len()];
-            for (azimuth, elevation) in scan.azimuth_rad.iter().zip(&scan.elevation_rad) {
-                if let Some(row) = pattern.row(*elevation) {
-                    rows[row].push(*azimuth);
+            for i in 0..scan.len() {
+                if let Some(row) = pattern.row(scan.elevation_rad[i], scan.range_m[i]) {
+                    rows[row].push(scan.azimuth_rad[i]);
                 }
             }
             let least = scan.azimuth_rad.iter().copied().fold(f32::INFINITY, f32::min) - step;

@@ -171,7 +171,7 @@ mod tests {
 
     fn seen(side: &SideFrame) -> FrameAlone {
         let steps = Steps { azimuth_rad: STEP, elevation_rad: 0.01 };
-        let pattern = ScanPattern { rows_rad: ROWS.to_vec(), steps };
+        let pattern = ScanPattern { rows_rad: ROWS.to_vec(), steps, ..ScanPattern::default() };
         frame_alone(side, &Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 })
     }
 

@@ -323,7 +323,7 @@ mod tests {
 
     fn paired(kept: usize, corrections: Corrections) -> FramePair {
         let steps = Steps { azimuth_rad: 0.003, elevation_rad: 0.006 };
-        let pattern = ScanPattern { rows_rad: rows(), steps };
+        let pattern = ScanPattern { rows_rad: rows(), steps, ..ScanPattern::default() };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
         let origin = sensors.rig.sensors[0].position;
         let bbox = Box3::from_array([origin[0] + 12.0, origin[1], origin[2], 4.0, 2.0, 1.6, 0.0]);

@@ -48,7 +48,7 @@ fn mixed_of(sensors: &Sensors, sensor: usize, scan: &SensorScan) -> f64 {
     let mut smooth = |i: usize| *smooth[i].get_or_insert_with(|| predictor.is_smooth(scan, i, &mut neighbours));
     let returns = Returns { scan, index: &predictor.around.index };
     let SensorScan { azimuth_rad: azimuth, elevation_rad: elevation, .. } = scan;
-    let rows = rows_of(scan, |i| sensors.row(sensor, elevation[i]));
+    let rows = rows_of(scan, |i| sensors.row(sensor, elevation[i], scan.range_m[i]));
     let mut of_pair = |a: usize, b: usize, apart_rad: f64| {
         let mixes = returns.gap_mixes(a, b) && !smooth(a) && !smooth(b);
         if mixes { returns.mixing_share(a, b) / apart_rad.max(1e-5) } else { 0.0 }
@@ -139,6 +139,7 @@ mod tests {
         let pattern = ScanPattern {
             rows_rad: (0..ROWS).map(|row| row as f32 * 0.01).collect(),
             steps: Steps { azimuth_rad: STEP_RAD, elevation_rad: 0.01 },
+            ..ScanPattern::default()
         };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
         assert_eq!(mixed_per_rad(&[board(0..0)], &sensors), 0.0);

@@ -22,7 +22,10 @@ pub struct Matched {
 pub fn match_directions(a: &SensorScan, b: &SensorScan, pattern: &ScanPattern, closes: bool) -> Matched {
     let steps = pattern.steps;
     let window = Steps { azimuth_rad: 1.5 * steps.azimuth_rad, elevation_rad: 0.7 * steps.elevation_rad };
-    let rows = [a, b].map(|scan| scan.elevation_rad.iter().map(|el| pattern.row(*el)).collect::<Vec<_>>());
+    let rows_of = |scan: &SensorScan| {
+        scan.elevation_rad.iter().zip(&scan.range_m).map(|(el, m)| pattern.row(*el, *m)).collect::<Vec<_>>()
+    };
+    let rows = [a, b].map(rows_of);
     let index = DirectionIndex::new(b, window, closes);
     let (shifts, common) = row_shifts(a, &index, &rows, pattern, window);
     let repeats = !pattern.rows_rad.is_empty() || common >= COMMON;
@@ -164,6 +167,7 @@ mod tests {
         let pattern = ScanPattern {
             rows_rad: (0..10).map(|r| -0.2 + 0.02 * r as f32).collect(),
             steps: Steps { azimuth_rad: 0.01, elevation_rad: 0.02 },
+            ..ScanPattern::default()
         };
         for phase in [0.0, 0.2, 0.5, 0.9] {
             let (a, b) = (scan(phase, 0.1, 1), scan(0.0, 0.0, 2));

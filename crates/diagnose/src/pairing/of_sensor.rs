@@ -123,7 +123,7 @@ impl SensorPair<'_> {
             if is_ray {
                 ray.matched = *matched;
                 (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
-                ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
+                ray.row = self.sensors.row(self.sensor, ray.elevation_rad, self.sent.range_m[i]);
                 ray.recorded_m = (turn * self.sent.point(i).coords).cast::<f32>().into();
                 rays.push(ray);
             }
@@ -226,7 +226,7 @@ mod tests {
     fn shots_without_a_return_are_counted_except_beside_returns() {
         let (rows, step) = ([-0.06f32, -0.04, -0.02, 0.0], 0.01f32);
         let steps = Steps { azimuth_rad: step, elevation_rad: 0.02 };
-        let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
+        let pattern = ScanPattern { rows_rad: rows.to_vec(), steps, ..ScanPattern::default() };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.1 };
         let scan_up_to = |columns: usize| {
             let shots: Vec<_> = rows.iter().flat_map(|el| (0..columns).map(move |k| (k as f32 * step, *el))).collect();

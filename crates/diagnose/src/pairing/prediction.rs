@@ -81,7 +81,7 @@ impl<'a> Predictor<'a> {
             matched: false,
             company: 0,
             shown: false,
-            row: self.sensors.row(self.sensor, el),
+            row: self.sensors.row(self.sensor, el, range),
             object: u16::MAX,
             azimuth_rad: az,
             elevation_rad: el,

@@ -133,7 +133,7 @@ mod tests {
     /// Variances of the roughness of both sides, m2, and returns with one.
     fn variances(measured: SensorScan, simulated: SensorScan, rows: &[f32]) -> ([f64; 2], usize) {
         let steps = Steps { azimuth_rad: 0.003, elevation_rad: 0.006 };
-        let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
+        let pattern = ScanPattern { rows_rad: rows.to_vec(), steps, ..ScanPattern::default() };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
         let [of_measured, of_simulated] = [&measured, &simulated].map(|scan| vec![true; scan.len()]);
         let matched = [Matched { measured: of_measured, simulated: of_simulated, repeats: true }];

@@ -54,7 +54,7 @@ pub type RowEdges = [[Jumps; JUMPS]; OCTANTS];
 pub(super) fn edges_of(scans: &[SensorScan], sensors: &Sensors) -> RowEdges {
     let mut sum = RowEdges::default();
     for (sensor, scan) in scans.iter().enumerate() {
-        let of_scan = row_edges(scan, |i| sensors.row(sensor, scan.elevation_rad[i]));
+        let of_scan = row_edges(scan, |i| sensors.row(sensor, scan.elevation_rad[i], scan.range_m[i]));
         sum.iter_mut().flatten().zip(of_scan.iter().flatten()).for_each(|(all, one)| all.merge(one));
     }
     sum

@@ -18,7 +18,7 @@ use crate::catalogue::Cause;
 use crate::diagnosis::{
     Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, Predicted, SCHEMA, Verdict,
 };
-use crate::effects::fill_effects;
+use crate::effects::{RowsOf, fill_effects};
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::extended::extended_toml;
@@ -27,7 +27,8 @@ use crate::search::REPETITIONS;
 use data::{Cloud, Dataset, Object};
 use planes::Patch;
 use rayon::prelude::*;
-use rings::{Beam, RingScan};
+use rings::RingScan;
+use sensor::directions::lasers::Beam;
 use sensor::{Rig, Sensor};
 use std::collections::BTreeMap;
 
@@ -83,8 +84,11 @@ pub fn diagnose_scans(
     let (found, minimum_detectable, considered) = findings::all(&seen, &mut notes);
     progress(Stage::Weighing, 1, 1);
     let mut diagnosis = report(&seen, found, minimum_detectable, considered, notes);
-    let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
-    fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
+    let rows = RowsOf {
+        deg: seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect(),
+        heights_m: seen.beams.iter().rev().map(|b| b.height_m).collect(),
+    };
+    fill_effects(&mut diagnosis.findings, rig, &[rows]);
     // Contrasts of single lasers are differences of intensities, not gains.
     let contrasts = diagnosis.findings.iter_mut().filter(|f| f.cause == Some(Cause::BeamIntensity));
     contrasts.for_each(|f| f.effects.clear());

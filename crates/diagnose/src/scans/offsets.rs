@@ -4,8 +4,8 @@
 //! these.
 
 use super::planes::Patch;
-use super::rings::Beam;
 use nalgebra::{Matrix3, Vector3};
+use sensor::directions::lasers::Beam;
 use std::collections::BTreeMap;
 
 /// Sums of one wall: residuals along the rays against the derivatives by the wall's own plane.

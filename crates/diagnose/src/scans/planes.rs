@@ -1,9 +1,10 @@
 //! Planes of the ground and of walls that are fitted to a scan; everything else is masked.
 
-use super::rings::{Beam, RingScan, Shot};
+use super::rings::{RingScan, Shot};
 use data::{Object, Stream};
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 use rand::RngExt;
+use sensor::directions::lasers::Beam;
 
 /// A plane n . p = d, m.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -2,9 +2,9 @@
 //! cancel.
 
 use super::planes::Patch;
-use super::rings::Beam;
 use crate::inference::simplex::minimise;
 use rayon::prelude::*;
+use sensor::directions::lasers::Beam;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Bins of range and incidence with the sums of one scan.

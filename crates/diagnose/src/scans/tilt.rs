@@ -1,8 +1,9 @@
 //! A common elevation error: the ground becomes a cone, and vertical walls lean outwards on all sides.
 
 use super::planes::{Patch, Plane};
-use super::rings::{Beam, RingScan};
+use super::rings::RingScan;
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
+use sensor::directions::lasers::Beam;
 
 /// Distances of the ground that is used, m.
 const GROUND_M: [f64; 2] = [4.0, 25.0];

@@ -5,6 +5,7 @@
 
 mod around;
 mod far_surfaces;
+pub mod lasers;
 mod pattern;
 mod scan;
 mod surface;
@@ -41,9 +42,9 @@ impl Sensors {
         Sensors { rig: rig.clone(), patterns: (0..rig.sensors.len()).map(of_sensor).collect(), edge_m: EDGE_M }
     }
 
-    /// Row of a shot from the lowest; `u16::MAX` where rows are not known.
-    pub fn row(&self, sensor: usize, elevation_rad: f32) -> u16 {
-        self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
+    /// Row, from the lowest, of a return at an elevation and a range; `u16::MAX` where rows are not known.
+    pub fn row(&self, sensor: usize, elevation_rad: f32, range_m: f32) -> u16 {
+        self.patterns[sensor].row(elevation_rad, range_m).map_or(u16::MAX, |r| r as u16)
     }
 
     /// Half widths of the window in which the neighbours of a direction are looked for.

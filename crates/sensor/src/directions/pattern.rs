@@ -1,13 +1,17 @@
 //! Rows and angular steps of a sensor, estimated from the directions of its returns.
 
+use super::lasers;
 use super::scan::{SensorScan, Steps};
 use statistics::weighted_median;
 
 /// Scan pattern of a sensor.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ScanPattern {
     /// Elevation of each row from the lowest, rad; empty where no rows are found.
     pub rows_rad: Vec<f32>,
+    /// Height of the origin of each row's rays over that of the sensor, m; empty where all rays start there. Seen from
+    /// the sensor's origin such a row is at another elevation for each range.
+    pub heights_m: Vec<f32>,
     /// Typical angle between neighbouring shots.
     pub steps: Steps,
 }
@@ -25,10 +29,14 @@ impl ScanPattern {
 
     /// From scans of several frames of both sides, whose shots have the same directions.
     pub fn of_scans(scans: &[&SensorScan]) -> ScanPattern {
-        let mut rows_rad = rows(scans);
-        let azimuth = azimuth_step(scans, &rows_rad);
+        let (mut rows_rad, mut heights_m) = (rows(scans), Vec::new());
+        if rows_rad.is_empty() {
+            (rows_rad, heights_m) = rows_of_lasers(scans);
+        }
+        let azimuth = azimuth_step(scans, &rows_rad, &heights_m);
         if rows_rad.len() < 4 || azimuth.is_none() {
             rows_rad.clear();
+            heights_m.clear();
         }
         let steps = match azimuth {
             Some(azimuth_rad) if !rows_rad.is_empty() => {
@@ -38,14 +46,18 @@ impl ScanPattern {
             }
             _ => even_steps(scans),
         };
-        ScanPattern { rows_rad, steps }
+        ScanPattern { rows_rad, heights_m, steps }
     }
 
-    /// Row of an elevation; `None` without rows, or farther from the nearest than 0.4 of its distance to the next.
-    pub fn row(&self, elevation_rad: f32) -> Option<usize> {
+    /// Row of a return at an elevation and a range, infinite for shots without one; `None` without rows, or farther
+    /// from the nearest than 0.4 of its distance to the next.
+    pub fn row(&self, elevation_rad: f32, range_m: f32) -> Option<usize> {
         let rows = &self.rows_rad;
         if rows.is_empty() {
             return None;
+        }
+        if !self.heights_m.is_empty() {
+            return self.row_of_lasers(elevation_rad, range_m);
         }
         let i = rows.partition_point(|r| *r < elevation_rad);
         let nearest = if i == 0 {
@@ -62,6 +74,44 @@ impl ScanPattern {
         };
         ((rows[nearest] - elevation_rad).abs() < 0.4 * gap).then_some(nearest)
     }
+
+    /// The same for rows with heights of their own: the row on whose cone the return lies.
+    fn row_of_lasers(&self, elevation_rad: f32, range_m: f32) -> Option<usize> {
+        let (mut nearest, mut next) = ((f32::INFINITY, 0), f32::INFINITY);
+        for (row, (at, height_m)) in self.rows_rad.iter().zip(&self.heights_m).enumerate() {
+            let off = (elevation_rad - at - height_m * at.cos() / range_m).abs();
+            if off < nearest.0 {
+                (nearest, next) = ((off, row), nearest.0);
+            } else {
+                next = next.min(off);
+            }
+        }
+        (nearest.0 < 0.4 * (nearest.0 + next)).then_some(nearest.1)
+    }
+}
+
+/// Fewest lasers of a sensor whose rows are found by the order of its points.
+const FEWEST_LASERS: usize = 8;
+
+/// Least share of the returns of a scan on the cones of its lasers. A sensor's own points lie on them exactly; those of
+/// a simulation that shoots from one point do not, and would spoil the table.
+const ON_CONES: f64 = 0.98;
+
+/// Elevations, from the lowest, rad, and heights, m, of rows whose rays do not start in one point, from those scans
+/// that keep the order of the lasers; empty without such scans.
+fn rows_of_lasers(scans: &[&SensorScan]) -> (Vec<f32>, Vec<f32>) {
+    let cones_of = |scan: &&SensorScan| {
+        let point = |i: usize| {
+            let [range, elevation] = [scan.range_m[i], scan.elevation_rad[i]].map(f64::from);
+            [range * elevation.cos(), range * elevation.sin(), f64::from(scan.azimuth_rad[i]), 0.0]
+        };
+        let cones = lasers::cones(&lasers::rings((0..scan.len()).map(point)));
+        let on: f64 = cones.iter().map(lasers::Cone::points).sum();
+        let found = cones.len() >= FEWEST_LASERS && on > ON_CONES * scan.len() as f64;
+        if found { cones } else { vec![] }
+    };
+    let beams = lasers::beams(scans.iter().flat_map(cones_of).collect());
+    beams.iter().rev().map(|beam| (beam.elevation_rad as f32, beam.height_m as f32)).unzip()
 }
 
 /// Half width of the window of the local mean of the histogram, bins: 0.9 degrees.
@@ -160,16 +210,16 @@ fn dense_bins(counts: &[f32]) -> Vec<bool> {
 }
 
 /// The usual difference of neighbouring azimuths within a row.
-fn azimuth_step(scans: &[&SensorScan], rows: &[f32]) -> Option<f32> {
+fn azimuth_step(scans: &[&SensorScan], rows: &[f32], heights_m: &[f32]) -> Option<f32> {
     if rows.len() < 4 {
         return None;
     }
-    let pattern = ScanPattern { rows_rad: rows.to_vec(), steps: Steps { azimuth_rad: 0.0, elevation_rad: 0.0 } };
+    let pattern = ScanPattern { rows_rad: rows.to_vec(), heights_m: heights_m.to_vec(), ..ScanPattern::default() };
     let mut differences = Vec::new();
     for scan in scans {
         let mut by_row: Vec<Vec<f32>> = vec![Vec::new(); rows.len()];
         for i in 0..scan.len() {
-            if let Some(row) = pattern.row(scan.elevation_rad[i]) {
+            if let Some(row) = pattern.row(scan.elevation_rad[i], scan.range_m[i]) {
                 by_row[row].push(scan.azimuth_rad[i]);
             }
         }
@@ -232,12 +282,76 @@ mod tests {
         assert_eq!(pattern.rows_rad.len(), 24);
         assert!(pattern.rows_rad.iter().zip(&truth).all(|(a, b)| (a - b).abs() < 1e-4));
         assert!((pattern.steps.azimuth_rad - 0.01).abs() < 1e-3, "{:?}", pattern.steps);
-        assert_eq!(pattern.row(truth[7] + 1e-3), Some(7));
+        assert_eq!(pattern.row(truth[7] + 1e-3, 10.0), Some(7));
         let beside = f64::from(pattern.steps.elevation_rad) / 2.0;
         for (end, out) in [(truth[0], -1.0), (truth[23], 1.0)] {
             let [inside, outside] = [0.9, 1.1].map(|share| pattern.reaches(f64::from(end) + out * share * beside));
             assert!(inside && !outside);
         }
+    }
+
+    /// Two blocks of lasers at heights of their own, as in an HDL-64E. Seen from the origin of the cloud the rows
+    /// overlap; by range and elevation each return belongs to one.
+    #[test]
+    fn rows_of_lasers_with_origins_of_their_own_are_found_by_the_order_of_the_points() {
+        let lasers: Vec<lasers::Beam> = (0..24)
+            .map(|k| lasers::Beam {
+                elevation_rad: (2.0 - 0.4 * f64::from(k)).to_radians(),
+                height_m: if k < 12 { 0.2 } else { 0.12 },
+            })
+            .collect();
+        // Walls of a room that is no circle, and the ground.
+        let at = |laser: &lasers::Beam, azimuth: f64| {
+            let wall_m = 6.0 + 9.0 * (1.5 * azimuth).sin().powi(2);
+            let down = laser.direction(azimuth).z;
+            if down < 0.0 { wall_m.min((1.7 + laser.height_m) / -down) } else { wall_m }
+        };
+        let (mut scan, mut of) = (SensorScan::default(), Vec::new());
+        for (k, laser) in lasers.iter().enumerate() {
+            for i in 0..900 {
+                let azimuth = (0.1 + 0.4 * f64::from(i)).to_radians();
+                let [az, el, range] = crate::rig::Sensor::spherical(&laser.point(azimuth, at(laser, azimuth)).into());
+                scan.azimuth_rad.push(az as f32);
+                scan.elevation_rad.push(el as f32);
+                scan.range_m.push(range as f32);
+                of.push(lasers.len() - 1 - k);
+            }
+        }
+        // The simulated side shoots the same directions from one point, so that its points lie on no cone.
+        let mut simulated = scan.clone();
+        simulated.range_m.iter_mut().enumerate().for_each(|(i, m)| *m *= 1.0 + 0.03 * (i as f32).sin());
+        let pattern = ScanPattern::of_scans(&[&scan, &simulated, &scan, &simulated]);
+        assert_eq!((pattern.rows_rad.len(), pattern.heights_m.len()), (24, 24));
+        for (row, laser) in lasers.iter().rev().enumerate() {
+            assert!((f64::from(pattern.rows_rad[row]) - laser.elevation_rad).abs() < 1e-4, "row {row}");
+            assert!((f64::from(pattern.heights_m[row]) - laser.height_m).abs() < 2e-3, "row {row}");
+        }
+        let row = |i: usize| pattern.row(scan.elevation_rad[i], scan.range_m[i]);
+        let right = (0..scan.len()).filter(|i| row(*i) == Some(of[*i])).count();
+        assert!(right as f64 > 0.95 * scan.len() as f64, "{right} of {}", scan.len());
+        assert!((f64::from(pattern.steps.azimuth_rad) - 0.4f64.to_radians()).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_real_sensor_of_two_blocks_has_its_64_rows() {
+        let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/kitti/training/velodyne");
+        let read = |name: &str| std::fs::read(std::path::Path::new(root).join(name));
+        let (Ok(one), Ok(other)) = (read("000000.bin"), read("000001.bin")) else {
+            eprintln!("not run: {root} is not there");
+            return;
+        };
+        let scans = [one, other].map(|bytes| {
+            let values = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            let cloud = data::Cloud { values, channels: 4 };
+            super::super::split_by_sensor(&cloud, &crate::Rig::single()).remove(0)
+        });
+        let pattern = ScanPattern::of_scans(&scans.each_ref());
+        assert_eq!(pattern.rows_rad.len(), 64);
+        let [lower, upper] = [&pattern.heights_m[..32], &pattern.heights_m[32..]];
+        assert!(lower.iter().all(|m| (0.10..0.14).contains(m)) && upper.iter().all(|m| (0.18..0.23).contains(m)));
+        let known = |i: &usize| pattern.row(scans[0].elevation_rad[*i], scans[0].range_m[*i]).is_some();
+        let share = (0..scans[0].len()).filter(known).count() as f64 / scans[0].len() as f64;
+        assert!(share > 0.98, "{share}");
     }
 
     #[test]

@@ -80,7 +80,7 @@ fn split(cloud: &Cloud, rig: &Rig, mut given: impl FnMut(usize, usize)) -> Vec<S
 }
 
 /// Angle between neighbouring shots of a sensor, rad.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Steps {
     /// Along a row.
     pub azimuth_rad: f32,

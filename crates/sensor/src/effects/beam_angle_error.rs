@@ -1,7 +1,7 @@
 //! C3: constant direction errors of each beam (row).
 
 use super::reshoot::reaim;
-use super::row_table::{Rows, check_rows};
+use super::row_table::{RowTable, Rows, check_rows};
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, turned};
 use crate::scan::{Echo, Scan};
@@ -34,6 +34,9 @@ pub struct BeamAngleError {
     /// Elevations of that sensor's rows, ascending, degrees.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub rows_deg: Vec<f64>,
+    /// Height of the origin of each row's rays over that of the sensor, m; empty where all rays start there.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub heights_m: Vec<f64>,
     /// Elevation error of each of them, degrees; it is added to `elevation_deg` in place of a random value.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub elevations_deg: Vec<f64>,
@@ -49,6 +52,17 @@ impl BeamAngleError {
 }
 
 impl BeamAngleError {
+    fn table(&self) -> RowTable<'_> {
+        RowTable {
+            sensor: &self.sensor,
+            rows_deg: &self.rows_deg,
+            heights_m: &self.heights_m,
+            name: "elevations_deg",
+            most: 5.0,
+            values: &self.elevations_deg,
+        }
+    }
+
     /// Elevation error of a row of the table, upwards, rad.
     fn up_rad(&self, row: Option<usize>) -> f32 {
         let own = row.and_then(|row| self.elevations_deg.get(row)).copied().unwrap_or(0.0);
@@ -60,7 +74,7 @@ impl SensorEffect for BeamAngleError {
     fn check(&self) -> Result<(), KeyError> {
         within("elevation_deg", self.elevation_deg, -5.0, 5.0)?;
         within("elevation_std_deg", self.elevation_std_deg, 0.0, 5.0)?;
-        check_rows(&self.sensor, &self.rows_deg, ("elevations_deg", &self.elevations_deg), 5.0)?;
+        check_rows(&self.table())?;
         within("azimuth_std_deg", self.azimuth_std_deg, 0.0, 5.0)
     }
 
@@ -79,10 +93,10 @@ impl SensorEffect for BeamAngleError {
         if !self.rows_deg.is_empty() {
             let number = frame.rig.find(&self.sensor);
             let Some(sensor) = number.and_then(|number| beams.sensors.get_mut(number)) else { return };
-            let rows = Rows::new(0, Pose::identity(), &self.rows_deg);
+            let rows = Rows::new(0, Pose::identity(), &self.table());
             let nominal = sensor.nominal_directions.clone();
             for (direction, nominal) in sensor.true_directions_mut().iter_mut().zip(nominal.iter()) {
-                let row = rows.of_direction(Vector3::from(nominal.map(f64::from)));
+                let row = rows.of_direction(Vector3::from(nominal.map(f64::from)), f32::INFINITY);
                 *direction = turned(*direction, 0.0, self.up_rad(row));
             }
             return;
@@ -104,7 +118,7 @@ impl SensorEffect for BeamAngleError {
             return;
         }
         if !self.rows_deg.is_empty() {
-            let Some(rows) = Rows::of(&self.sensor, &self.rows_deg, frame) else { return };
+            let Some(rows) = Rows::of(&self.table(), frame) else { return };
             let up = |row, direction| turned(direction, 0.0, self.up_rad(Some(row)));
             let direction = |echo: &Echo| rows.row(echo).map_or(echo.direction, |row| up(row, echo.direction));
             return reaim(scan, frame, draws, direction);

@@ -1,6 +1,6 @@
 //! D9: a gain of the intensity of each beam (row).
 
-use super::row_table::{by_row, by_table, check_rows, stream_of_row};
+use super::row_table::{RowTable, by_row, by_table, check_rows, stream_of_row};
 use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
@@ -27,6 +27,22 @@ pub struct BeamIntensity {
     /// Elevations of that sensor's rows, ascending, degrees.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub rows_deg: Vec<f64>,
+    /// Height of the origin of each row's rays over that of the sensor, m; empty where all rays start there.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub heights_m: Vec<f64>,
+}
+
+impl BeamIntensity {
+    fn table(&self) -> RowTable<'_> {
+        RowTable {
+            sensor: &self.sensor,
+            rows_deg: &self.rows_deg,
+            heights_m: &self.heights_m,
+            name: "gains_ln",
+            most: 10.0,
+            values: &self.gains_ln,
+        }
+    }
 }
 
 impl SensorEffect for BeamIntensity {
@@ -38,7 +54,7 @@ impl SensorEffect for BeamIntensity {
                 "is missing: it gives the elevations of the rows of gains_ln",
             ));
         }
-        check_rows(&self.sensor, &self.rows_deg, ("gains_ln", &self.gains_ln), 10.0)
+        check_rows(&self.table())
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
@@ -55,8 +71,7 @@ impl SensorEffect for BeamIntensity {
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if !self.rows_deg.is_empty() {
-            let table = (self.sensor.as_str(), &self.rows_deg[..], &self.gains_ln[..]);
-            by_table(table, scan, frame, |echo, gain_ln| echo.intensity *= gain_ln.exp() as f32);
+            by_table(&self.table(), scan, frame, |echo, gain_ln| echo.intensity *= gain_ln.exp() as f32);
             return;
         }
         if self.std == 0.0 {
@@ -98,6 +113,7 @@ mod tests {
             gains_ln: (0..32).map(|row| 0.1 * f64::from(row)).collect(),
             sensor: sensor.into(),
             rows_deg: (0..32).map(|row| -15.0 + 25.0 / 31.0 * f64::from(row)).collect(),
+            heights_m: vec![],
         };
         let after = applied(&table("front"), &before);
         for (a, b) in after.returns().zip(before.returns()) {

@@ -1,6 +1,6 @@
 //! A7: a constant range offset of each beam (row).
 
-use super::row_table::{by_row, by_table, check_rows, stream_of_row};
+use super::row_table::{RowTable, by_row, by_table, check_rows, stream_of_row};
 use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
@@ -28,9 +28,23 @@ pub struct BeamRangeOffset {
     /// Elevations of that sensor's rows, ascending, degrees.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub rows_deg: Vec<f64>,
+    /// Height of the origin of each row's rays over that of the sensor, m; empty where all rays start there.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub heights_m: Vec<f64>,
 }
 
 impl BeamRangeOffset {
+    fn table(&self) -> RowTable<'_> {
+        RowTable {
+            sensor: &self.sensor,
+            rows_deg: &self.rows_deg,
+            heights_m: &self.heights_m,
+            name: "offsets_m",
+            most: 10.0,
+            values: &self.offsets_m,
+        }
+    }
+
     fn offset_m(&self, sensor: u8, row: u16, draws: &Draws) -> f32 {
         if !self.offsets_m.is_empty() {
             return self.offsets_m.get(usize::from(row)).map_or(0.0, |v| *v as f32);
@@ -43,7 +57,7 @@ impl BeamRangeOffset {
 impl SensorEffect for BeamRangeOffset {
     fn check(&self) -> Result<(), KeyError> {
         within("std_m", self.std_m, 0.0, 10.0)?;
-        check_rows(&self.sensor, &self.rows_deg, ("offsets_m", &self.offsets_m), 10.0)?;
+        check_rows(&self.table())?;
         self.offsets_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("offsets_m[{i}]"), *v, -10.0, 10.0))
     }
 
@@ -61,8 +75,7 @@ impl SensorEffect for BeamRangeOffset {
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if !self.rows_deg.is_empty() {
-            let table = (self.sensor.as_str(), &self.rows_deg[..], &self.offsets_m[..]);
-            by_table(table, scan, frame, |echo, offset_m| echo.add_range(offset_m as f32));
+            by_table(&self.table(), scan, frame, |echo, offset_m| echo.add_range(offset_m as f32));
             return;
         }
         by_row(scan, |sensor, row| self.offset_m(sensor, row, draws), |echo, offset_m| echo.add_range(offset_m));
@@ -116,6 +129,7 @@ mod tests {
             offsets_m: offsets_m.clone(),
             sensor: sensor.into(),
             rows_deg: rows_deg.clone(),
+            heights_m: vec![],
         };
         assert_eq!(table("front").needs(), Some(&[][..]));
         let after = applied(&table("front"), &before);

@@ -1,12 +1,26 @@
 //! Tables by row of one sensor, whose rows are distinguished by their elevations.
 
 use super::{Draws, FrameContext};
-use crate::directions::{ScanPattern, Steps};
+use crate::directions::ScanPattern;
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
 use geometry::Pose;
 use nalgebra::Vector3;
+
+/// Values of the rows of a sensor.
+pub(super) struct RowTable<'a> {
+    /// Name of the sensor.
+    pub sensor: &'a str,
+    /// Elevations, ascending, degrees.
+    pub rows_deg: &'a [f64],
+    /// Heights of the origins of their rays over that of the sensor, m; empty where they start there.
+    pub heights_m: &'a [f64],
+    /// Name of the values, and their largest magnitude.
+    pub name: &'static str,
+    pub most: f64,
+    pub values: &'a [f64],
+}
 
 /// Rows of a sensor of the rig.
 pub(super) struct Rows {
@@ -16,17 +30,17 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    /// Rows with ascending elevations, degrees; `None` where the rig does not have the sensor.
-    pub(super) fn of(sensor: &str, rows_deg: &[f64], frame: &FrameContext) -> Option<Rows> {
-        let number = frame.rig.find(sensor)?;
-        Some(Rows::new(number, frame.rig.sensors[number].pose().inverse(), rows_deg))
+    /// Rows of a table; `None` where the rig does not have the sensor.
+    pub(super) fn of(table: &RowTable, frame: &FrameContext) -> Option<Rows> {
+        let number = frame.rig.find(table.sensor)?;
+        Some(Rows::new(number, frame.rig.sensors[number].pose().inverse(), table))
     }
 
     /// Rows of the sensor with this number.
-    pub(super) fn new(sensor: usize, sensor_from_cloud: Pose, rows_deg: &[f64]) -> Rows {
-        let steps = Steps { azimuth_rad: 0.01, elevation_rad: 0.01 };
-        let rows_rad = rows_deg.iter().map(|deg| deg.to_radians() as f32).collect();
-        Rows { sensor, sensor_from_cloud, pattern: ScanPattern { rows_rad, steps } }
+    pub(super) fn new(sensor: usize, sensor_from_cloud: Pose, table: &RowTable) -> Rows {
+        let rows_rad = table.rows_deg.iter().map(|deg| deg.to_radians() as f32).collect();
+        let heights_m = table.heights_m.iter().map(|m| *m as f32).collect();
+        Rows { sensor, sensor_from_cloud, pattern: ScanPattern { rows_rad, heights_m, ..ScanPattern::default() } }
     }
 
     /// The row of an echo; `None` for echoes of other sensors and between rows.
@@ -35,26 +49,21 @@ impl Rows {
             return None;
         }
         let own = self.sensor_from_cloud.rotation * Vector3::from(echo.direction.map(f64::from));
-        self.of_direction(own)
+        self.of_direction(own, echo.range_m)
     }
 
-    /// The row of a direction in the sensor's frame.
-    pub(super) fn of_direction(&self, own: Vector3<f64>) -> Option<usize> {
-        self.pattern.row(own.z.atan2(own.x.hypot(own.y)) as f32)
+    /// The row of a direction in the sensor's frame, and of the range of the return there.
+    pub(super) fn of_direction(&self, own: Vector3<f64>, range_m: f32) -> Option<usize> {
+        self.pattern.row(own.z.atan2(own.x.hypot(own.y)) as f32, range_m)
     }
 }
 
 /// Changes the returns of a sensor by the values of its rows. Nothing changes where the rig does not have the sensor.
-pub(super) fn by_table(
-    (sensor, rows_deg, values): (&str, &[f64], &[f64]),
-    scan: &mut Scan,
-    frame: &FrameContext,
-    change: impl Fn(&mut Echo, f64),
-) {
-    let Some(rows) = Rows::of(sensor, rows_deg, frame) else { return };
+pub(super) fn by_table(table: &RowTable, scan: &mut Scan, frame: &FrameContext, change: impl Fn(&mut Echo, f64)) {
+    let Some(rows) = Rows::of(table, frame) else { return };
     for echo in scan.returns_mut() {
         if let Some(row) = rows.row(echo) {
-            change(echo, values[row]);
+            change(echo, table.values[row]);
         }
     }
 }
@@ -79,15 +88,21 @@ pub(super) fn stream_of_row(draws: &Draws, sensor: u8, row: u16) -> data::Stream
     draws.of_set(u64::from(sensor) << 16 | u64::from(row))
 }
 
-/// Checks a table: the sensor is named, rows ascend, there are at least two and as many values.
-pub(super) fn check_rows(sensor: &str, rows_deg: &[f64], values: (&str, &[f64]), most: f64) -> Result<(), KeyError> {
+/// Checks a table: the sensor is named, rows ascend, there are at least two and as many values, and as many heights or
+/// none.
+pub(super) fn check_rows(table: &RowTable) -> Result<(), KeyError> {
+    let RowTable { sensor, rows_deg, heights_m, name, most, values } = *table;
     if rows_deg.is_empty() {
         return Ok(());
     }
     if sensor.is_empty() {
         return Err(wrong("sensor", "is missing: a table by row belongs to one sensor"));
     }
-    let (name, values) = values;
+    if !heights_m.is_empty() && heights_m.len() != rows_deg.len() {
+        let why = format!("{} values for {} rows: there is one for each, or none", heights_m.len(), rows_deg.len());
+        return Err(wrong("heights_m", why));
+    }
+    heights_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("heights_m[{i}]"), *v, -10.0, 10.0))?;
     if rows_deg.len() < 2 || rows_deg.len() != values.len() {
         let why =
             format!("{} values for {} rows: a table has as many of each, at least 2", values.len(), rows_deg.len());

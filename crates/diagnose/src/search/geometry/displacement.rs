@@ -152,7 +152,7 @@ impl Displacement {
         let seen = pose.inverse_transform_point(&Point3::from(*point)).coords;
         let (range_m, flat_m) = (seen.norm(), seen.xy().norm());
         let elevation_rad = seen.z.atan2(flat_m);
-        let group = Group { sensor: sensor as u8, index: sensors.row(sensor, elevation_rad as f32) };
+        let group = Group { sensor: sensor as u8, index: sensors.row(sensor, elevation_rad as f32, range_m as f32) };
         let Some([offset_m, offset_rad]) = self.rows.get(&group) else { return Vector3::zeros() };
         // The shot was sent higher and came back over another length.
         let (sin, cos) = (elevation_rad + offset_rad).sin_cos();
@@ -227,7 +227,11 @@ mod tests {
 
     #[test]
     fn a_point_without_the_displacement_of_its_row_is_where_the_shot_met_it() {
-        let pattern = ScanPattern { rows_rad: vec![-0.1, 0.0], steps: Steps { azimuth_rad: 0.01, elevation_rad: 0.1 } };
+        let pattern = ScanPattern {
+            rows_rad: vec![-0.1, 0.0],
+            steps: Steps { azimuth_rad: 0.01, elevation_rad: 0.1 },
+            ..ScanPattern::default()
+        };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.1 };
         let pose = Isometry3::translation(1.0, 2.0, 3.0);
         let rows = Undone::from([(Group { sensor: 0, index: 0 }, [0.05, 0.02])]);
