@@ -109,11 +109,11 @@ impl Spot {
     }
 
     /// Whether it is smaller than the largest that is fitted, and no line: a row that loses returns has no ends along
-    /// azimuth.
+    /// azimuth, and what is no higher than two cells of directions may be the edge of a surface.
     pub fn has_ends(&self) -> bool {
         let [narrowest, widest] = DirtyWindow::ASPECT;
         let is_spot = (narrowest..=widest).contains(&self.aspect());
-        is_spot && (0..2).all(|k| self.radius[k] < 0.98 * LARGEST_RADIUS_RAD[k])
+        is_spot && self.radius[1] > ELEVATION_RAD && (0..2).all(|k| self.radius[k] < 0.98 * LARGEST_RADIUS_RAD[k])
     }
 
     /// A spot about as large as a patch.

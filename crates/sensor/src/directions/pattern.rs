@@ -78,7 +78,11 @@ impl ScanPattern {
     /// The same for rows with heights of their own: the row on whose cone the return lies.
     fn row_of_lasers(&self, elevation_rad: f32, range_m: f32) -> Option<usize> {
         let (mut nearest, mut next) = ((f32::INFINITY, 0), f32::INFINITY);
+        let most_rad = self.heights_m.iter().fold(0.0, |most: f32, m| most.max(m.abs())) / range_m;
         for (row, (at, height_m)) in self.rows_rad.iter().zip(&self.heights_m).enumerate() {
+            if (elevation_rad - at).abs() - most_rad > next {
+                continue;
+            }
             let off = (elevation_rad - at - height_m * at.cos() / range_m).abs();
             if off < nearest.0 {
                 (nearest, next) = ((off, row), nearest.0);

@@ -62,7 +62,7 @@ impl SensorEffect for BeamIntensity {
     }
 
     fn reads(&self) -> Reads {
-        if self.rows_deg.is_empty() { Reads::PATTERN } else { Reads::NOTHING }
+        self.table().reads()
     }
 
     fn sensor(&self) -> &str {

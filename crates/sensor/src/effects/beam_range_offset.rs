@@ -66,7 +66,7 @@ impl SensorEffect for BeamRangeOffset {
     }
 
     fn reads(&self) -> Reads {
-        if self.rows_deg.is_empty() { Reads::PATTERN } else { Reads::NOTHING }
+        self.table().reads()
     }
 
     fn sensor(&self) -> &str {
@@ -86,6 +86,10 @@ impl SensorEffect for BeamRangeOffset {
 mod tests {
     use super::super::testing::*;
     use super::*;
+    use crate::cloud_scan::{CloudReader, Surfaces};
+    use crate::directions::lasers::Beam;
+    use crate::rig::Rig;
+    use data::Cloud;
 
     #[test]
     fn rows_keep_their_offset_in_every_frame() {
@@ -145,6 +149,50 @@ mod tests {
         ] {
             let error = effect.check().unwrap_err().to_string();
             assert!(error.contains(want), "{error}");
+        }
+    }
+
+    /// Rows whose rays start at heights of their own are recognised by elevation and range, unless the cloud has rows by
+    /// elevation alone.
+    #[test]
+    fn rows_with_heights_are_those_of_the_cones() {
+        let lasers: Vec<Beam> = (0..16)
+            .map(|k| Beam {
+                elevation_rad: (-12.0 + 0.6 * f64::from(k)).to_radians(),
+                height_m: if k < 8 { 0.12 } else { 0.2 },
+            })
+            .collect();
+        let effect = BeamRangeOffset {
+            sensor: "lidar".into(),
+            rows_deg: lasers.iter().map(|l| l.elevation_rad.to_degrees()).collect(),
+            heights_m: lasers.iter().map(|l| l.height_m).collect(),
+            offsets_m: (1..17).map(|k| 0.01 * f64::from(k)).collect(),
+            ..BeamRangeOffset::default()
+        };
+        effect.check().unwrap();
+        let rig = Rig::single();
+        for heights in [1.0, 0.0] {
+            // By columns, so that the order of the points does not tell the lasers.
+            let mut cloud = Cloud::new(3);
+            for i in 0..600 {
+                let azimuth = (0.3 + 0.6 * f64::from(i)).to_radians();
+                for laser in lasers.iter().map(|l| Beam { height_m: heights * l.height_m, ..*l }) {
+                    let range_m =
+                        (4.0 + 20.0 * azimuth.sin().abs()).min((1.7 + laser.height_m) / -laser.direction(0.0).z);
+                    cloud.values.extend(laser.point(azimuth, range_m).map(|v| v as f32).iter());
+                }
+            }
+            let reader = CloudReader::of(&rig, std::slice::from_ref(&cloud), effect.reads());
+            assert_eq!(reader.sensors().patterns[0].rows_rad.is_empty(), heights == 1.0);
+            let before = reader.scan(&cloud, &Surfaces::default());
+            let mut after = before.clone();
+            with_frame(0, |frame, draws| {
+                let frame = FrameContext { rig: &rig, sensors: Some(reader.sensors()), ..*frame };
+                effect.on_scan(&mut after, &frame, draws);
+            });
+            let off = |i: usize| f64::from(after.echoes[i].range_m - before.echoes[i].range_m);
+            let right = (0..cloud.len()).filter(|i| (off(*i) - 0.01 * (i % 16 + 1) as f64).abs() < 1e-3).count();
+            assert!(right as f64 > 0.97 * cloud.len() as f64, "{right} of {}", cloud.len());
         }
     }
 }

@@ -1,6 +1,7 @@
 //! B7: directions hidden by parts of the ego vehicle.
 
 use super::{Draws, FrameContext, Reads, SensorEffect};
+use crate::rig;
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
@@ -80,12 +81,15 @@ impl SensorEffect for EgoBodyMask {
         }
         let boxes: Vec<[f32; 6]> = self.boxes.iter().map(|b| b.map(|v| v as f32)).collect();
         let sensor_from_cloud = only.map(|number| frame.rig.sensors[number].pose().inverse());
+        if let Some(number) = only {
+            self.add_shots(number, scan, frame);
+        }
         let mut random = draws.of_frame();
         for echo in scan.echoes.iter_mut().filter(|e| only.is_none_or(|number| usize::from(e.sensor) == number)) {
             let at = sensor_from_cloud.and_then(|pose| self.direction_of(pose.rotation * own_direction(echo)));
             let share = at.map_or(0.0, |k| self.directions[k][4]);
             let hidden = share > 0.0 && random.random_range(0.0..1.0_f64) < share;
-            let shown = at.filter(|k| hidden && self.returns_m.get(*k).is_some_and(|m| *m > 0.0));
+            let shown = at.filter(|k| hidden && self.is_shown(*k));
             if let Some(k) = shown {
                 self.show(echo, k, &mut random);
             } else if hidden || boxes.iter().any(|b| passes(echo, b)) {
@@ -96,6 +100,40 @@ impl SensorEffect for EgoBodyMask {
 }
 
 impl EgoBodyMask {
+    /// Adds the shots of a finished cloud into the directions of which it has none, where a part returns them: before the
+    /// open sky a cloud does not tell that a sensor shoots there. They are as dense as the others.
+    fn add_shots(&self, number: usize, scan: &mut Scan, frame: &FrameContext) {
+        let Some(sensors) = frame.sensors else { return };
+        let (pose, steps) = (frame.rig.sensors[number].pose(), sensors.patterns[number].steps);
+        let mut open: Vec<bool> = (0..self.directions.len()).map(|k| self.is_shown(k)).collect();
+        for echo in scan.echoes.iter().filter(|e| usize::from(e.sensor) == number) {
+            if let Some(k) = self.direction_of(pose.rotation.inverse() * own_direction(echo)) {
+                open[k] = false;
+            }
+        }
+        // Shots lie at whole steps.
+        let on_steps = |from_deg: f64, to_deg: f64, step_rad: f32| {
+            let step_deg = f64::from(step_rad).to_degrees().max(0.01);
+            let [first, end] = [from_deg, to_deg].map(|deg| (deg / step_deg).ceil() as i32);
+            (first..end).map(move |k| f64::from(k) * step_deg)
+        };
+        let origin = frame.rig.sensors[number].position.map(|v| v as f32);
+        for (d, _) in self.directions.iter().zip(&open).filter(|(_, open)| **open) {
+            for elevation in on_steps(d[2], d[3], steps.elevation_rad) {
+                scan.echoes.extend(on_steps(d[0], d[1], steps.azimuth_rad).map(|azimuth| {
+                    let own = rig::direction(azimuth.to_radians(), elevation.to_radians());
+                    let direction = pose.rotation * Vector3::from(own);
+                    Echo { sensor: number as u8, ..Echo::nothing(origin, direction.map(|v| v as f32).into()) }
+                }));
+            }
+        }
+    }
+
+    /// Whether the part itself is seen in a direction.
+    fn is_shown(&self, direction: usize) -> bool {
+        self.returns_m.get(direction).is_some_and(|m| *m > 0.0)
+    }
+
     /// Makes a return that of the part in a direction.
     fn show(&self, echo: &mut Echo, direction: usize, random: &mut impl Rng) {
         let mut drawn = |mean: f64, std: f64| mean + std * random.sample::<f64, _>(StandardNormal);
@@ -142,6 +180,8 @@ fn passes(echo: &Echo, b: &[f32; 6]) -> bool {
 mod tests {
     use super::super::testing::*;
     use super::*;
+    use crate::cloud_scan::{CloudReader, Surfaces};
+    use data::Cloud;
 
     #[test]
     fn returns_behind_the_box_are_lost_in_every_frame() {
@@ -189,6 +229,36 @@ mod tests {
         assert!(after.returns().all(|e| !hidden(e)));
         assert_eq!(applied(&mask("left"), &before), before);
         assert!(mask("").check().unwrap_err().to_string().contains("those of one sensor"));
+    }
+
+    /// A finished cloud without returns above the horizon does not tell that the sensor shoots there. A part that shows
+    /// itself before the open sky has as many returns as the sensor has shots.
+    #[test]
+    fn a_part_is_shown_before_the_open_sky() {
+        let mask = EgoBodyMask {
+            sensor: "lidar".into(),
+            directions: vec![[30.0, 50.0, 2.0, 6.0, 1.0], [50.0, 60.0, 2.0, 6.0, 0.5], [60.0, 70.0, 2.0, 6.0, 1.0]],
+            returns_m: vec![3.0, 3.0],
+            ..EgoBodyMask::default()
+        };
+        // The ground, by rows of 0.5 degrees and columns of 0.4.
+        let (rig, mut cloud) = (rig::Rig::single(), Cloud::new(3));
+        for (row, column) in (0..30).flat_map(|row| (0..900).map(move |column| (row, column))) {
+            let d = rig::direction((0.4 * f64::from(column)).to_radians(), (-18.0 + 0.5 * f64::from(row)).to_radians());
+            cloud.values.extend(d.map(|v| (v * 1.7 / -d[2]) as f32));
+        }
+        let reader = CloudReader::of(&rig, std::slice::from_ref(&cloud), mask.reads());
+        let mut scan = reader.scan(&cloud, &Surfaces::default());
+        let before = scan.returns().count();
+        with_frame(0, |frame, draws| {
+            let frame = FrameContext { rig: &rig, sensors: Some(reader.sensors()), ..*frame };
+            mask.on_scan(&mut scan, &frame, draws);
+        });
+        let shown: Vec<&Echo> = scan.returns().filter(|e| e.direction[2] > 0.0).collect();
+        // 8 rows; 50 columns all of which are hidden, 25 of which half are.
+        assert!((460..=540).contains(&shown.len()), "{}", shown.len());
+        assert!(shown.iter().all(|e| e.range_m == 3.0));
+        assert_eq!(scan.returns().count() - shown.len(), before);
     }
 
     #[test]

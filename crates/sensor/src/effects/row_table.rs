@@ -1,6 +1,6 @@
 //! Tables by row of one sensor, whose rows are distinguished by their elevations.
 
-use super::{Draws, FrameContext};
+use super::{Draws, FrameContext, Reads};
 use crate::directions::ScanPattern;
 use crate::scan::{Echo, Scan};
 use data::KeyError;
@@ -14,12 +14,20 @@ pub(super) struct RowTable<'a> {
     pub sensor: &'a str,
     /// Elevations, ascending, degrees.
     pub rows_deg: &'a [f64],
-    /// Heights of the origins of their rays over that of the sensor, m; empty where they start there.
+    /// Heights of the origins of their rays over that of the sensor, m; empty where they start there. A simulation whose
+    /// rays start in one point all the same has its rows at their elevations.
     pub heights_m: &'a [f64],
     /// Name of the values, and their largest magnitude.
     pub name: &'static str,
     pub most: f64,
     pub values: &'a [f64],
+}
+
+impl RowTable<'_> {
+    /// What an effect by this table reads of a finished cloud.
+    pub(super) fn reads(&self) -> Reads {
+        if self.rows_deg.is_empty() || !self.heights_m.is_empty() { Reads::PATTERN } else { Reads::NOTHING }
+    }
 }
 
 /// Rows of a sensor of the rig.
@@ -33,7 +41,12 @@ impl Rows {
     /// Rows of a table; `None` where the rig does not have the sensor.
     pub(super) fn of(table: &RowTable, frame: &FrameContext) -> Option<Rows> {
         let number = frame.rig.find(table.sensor)?;
-        Some(Rows::new(number, frame.rig.sensors[number].pose().inverse(), table))
+        let mut rows = Rows::new(number, frame.rig.sensors[number].pose().inverse(), table);
+        let from_one_point = |p: &ScanPattern| !p.rows_rad.is_empty() && p.heights_m.is_empty();
+        if frame.sensors.is_none_or(|sensors| from_one_point(&sensors.patterns[number])) {
+            rows.pattern.heights_m.clear();
+        }
+        Some(rows)
     }
 
     /// Rows of the sensor with this number.
