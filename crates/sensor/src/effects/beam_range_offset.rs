@@ -152,8 +152,8 @@ mod tests {
         }
     }
 
-    /// Rows whose rays start at heights of their own are recognised by elevation and range, unless the cloud has rows by
-    /// elevation alone.
+    /// Rows whose rays start at heights of their own are recognised by elevation and range, unless the cloud has rows
+    /// by elevation alone.
     #[test]
     fn rows_with_heights_are_those_of_the_cones() {
         let lasers: Vec<Beam> = (0..16)

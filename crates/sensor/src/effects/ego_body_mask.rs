@@ -100,8 +100,8 @@ impl SensorEffect for EgoBodyMask {
 }
 
 impl EgoBodyMask {
-    /// Adds the shots of a finished cloud into the directions of which it has none, where a part returns them: before the
-    /// open sky a cloud does not tell that a sensor shoots there. They are as dense as the others.
+    /// Adds the shots of a finished cloud into the directions of which it has none, where a part returns them: before
+    /// the open sky a cloud does not tell that a sensor shoots there. They are as dense as the others.
     fn add_shots(&self, number: usize, scan: &mut Scan, frame: &FrameContext) {
         let Some(sensors) = frame.sensors else { return };
         let (pose, steps) = (frame.rig.sensors[number].pose(), sensors.patterns[number].steps);

@@ -14,8 +14,8 @@ pub(super) struct RowTable<'a> {
     pub sensor: &'a str,
     /// Elevations, ascending, degrees.
     pub rows_deg: &'a [f64],
-    /// Heights of the origins of their rays over that of the sensor, m; empty where they start there. A simulation whose
-    /// rays start in one point all the same has its rows at their elevations.
+    /// Heights of the origins of their rays over that of the sensor, m; empty where they start there. A simulation
+    /// whose rays start in one point all the same has its rows at their elevations.
     pub heights_m: &'a [f64],
     /// Name of the values, and their largest magnitude.
     pub name: &'static str,
